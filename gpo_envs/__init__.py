@@ -7,11 +7,25 @@ Importing this package registers `rllab/<Task>-v0` and gives Gymnasium's own MuJ
 
 import gymnasium as gym
 
-from gpo_envs import gymnasium_tasks
+from gpo_envs import gymnasium_tasks, rllab
 
 HORIZON = 512  # steps per episode in the paper, section 4
 
 GYMNASIUM_TASKS = (gymnasium_tasks.HalfCheetahV4, gymnasium_tasks.HalfCheetahV5)
 
+
+def entry_point(creator: type) -> str:
+    """The string by which Gymnasium's registry finds a class."""
+    return f"{creator.__module__}:{creator.__name__}"
+
+
 for task in GYMNASIUM_TASKS:
-    gym.spec(task.env_id).vector_entry_point = f"{task.__module__}:{task.__name__}"
+    gym.spec(task.env_id).vector_entry_point = entry_point(task)
+
+for env in rllab.TASKS:
+    gym.register(
+        env.task.env_id,
+        entry_point=entry_point(env),
+        vector_entry_point=entry_point(env.task),
+        max_episode_steps=HORIZON,
+    )

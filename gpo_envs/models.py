@@ -27,3 +27,25 @@ def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
         mujoco.mj_setTotalmass(model, total_mass)
         mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
+
+
+def use_old_capsule_masses(model: mujoco.MjModel, spec: mujoco.MjSpec) -> None:
+    """Give the bodies of `model`, compiled from `spec`, the masses and inertias of MuJoCo before 2.1.1.
+
+    Until then (changelog of 2.1.1) a capsule of radius r and half length h weighed as a solid cylinder of half length
+    h + r / 2. rllab ran on MuJoCo 1.31, so this is what the paper's robots weighed: 2 % (HalfCheetah's torso) to 10 %
+    (the double pendulum's cart) away from the exact value.
+    """
+    twin = spec.copy()
+    for geom in twin.geoms:
+        if model.geom_type[geom.id] == mujoco.mjtGeom.mjGEOM_CAPSULE:
+            radius, half_length, _ = model.geom_size[geom.id]
+            geom.type = mujoco.mjtGeom.mjGEOM_CYLINDER
+            geom.fromto[0] = float("nan")  # the mark of "not given by its end points"
+            geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+            geom.pos, geom.quat = model.geom_pos[geom.id], model.geom_quat[geom.id]
+            geom.size = [radius, half_length + radius / 2, 0]
+    cylinders = compile_spec(twin)
+    for name in ("body_mass", "body_inertia", "body_ipos", "body_iquat"):
+        getattr(model, name)[:] = getattr(cylinders, name)
+    mujoco.mj_setConst(model, mujoco.MjData(model))

@@ -8,6 +8,7 @@ start more ranks.
 
 from numbers import Integral
 from types import SimpleNamespace
+from typing import ClassVar
 
 import gymnasium as gym
 import mujoco
@@ -47,7 +48,7 @@ class MujocoVectorEnv(gym.vector.VectorEnv):
         ValueError: for a number of copies or a limit that is not positive.
     """
 
-    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+    metadata: ClassVar[dict] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
 
     env_id: str  # the registered id whose batched form this is
     frame_skip: int  # physics steps per environment step
