@@ -18,6 +18,7 @@ import numpy as np
 from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 
 from gpo_envs.models import compile_spec, load_spec, use_old_capsule_masses
+from gpo_envs.terrain import add_terrain, hills
 from gpo_envs.vector import MujocoVectorEnv
 
 EULER, RK4 = mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4
@@ -142,6 +143,227 @@ class HalfCheetah(RllabVectorEnv):
         out[:, 17:] = self.now.center_of_mass
 
 
+class Walker2d(RllabVectorEnv):
+    """walker2d_env.py: walk; an episode ends when the torso falls or tips over. Positions start z, x, pitch."""
+
+    env_id = "rllab/Walker2d-v0"
+    xml_file = "walker2d.xml"
+    observation_size = 21
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        spec.option.timestep, spec.option.integrator = 0.005, EULER
+        swap_root_slides(spec)
+        set_motors(spec, [150, 100, 100, 150, 100, 100])
+
+    def reward(self) -> np.ndarray:
+        return self.now.velocity[:, 0] - self.control_cost(0.005)
+
+    def terminated(self) -> np.ndarray:
+        height, pitch = self.now.qpos[:, 0], self.now.qpos[:, 2]
+        return ~((0.8 < height) & (height < 2.0) & (-1.0 < pitch) & (pitch < 1.0))
+
+    def observe(self, out: np.ndarray) -> None:
+        out[:, :9] = self.now.qpos
+        out[:, 9:18] = self.now.qvel
+        out[:, 18:] = self.now.center_of_mass
+
+
+class Hopper(RllabVectorEnv):
+    """hopper_env.py: hop, paid 1 a step for not falling. Positions start z, x, pitch."""
+
+    env_id = "rllab/Hopper-v0"
+    xml_file = "hopper.xml"
+    observation_size = 20
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        spec.option.timestep, spec.option.integrator = 0.02, RK4
+        swap_root_slides(spec)
+        set_motors(spec, [200, 200, 200])
+
+    def views(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
+        return {**super().views(data), "constraint_forces": data.qfrc_constraint}
+
+    def reward(self) -> np.ndarray:
+        return self.now.velocity[:, 0] + 1 - self.control_cost(0.005)
+
+    def terminated(self) -> np.ndarray:
+        qpos, qvel = self.now.qpos, self.now.qvel
+        bounded = (np.abs(qpos[:, 3:]) < 100).all(axis=1) & (np.abs(qvel) < 100).all(axis=1)
+        upright = (qpos[:, 0] > 0.7) & (np.abs(qpos[:, 2]) < 0.2)
+        return ~(bounded & upright & np.isfinite(qpos).all(axis=1))
+
+    def observe(self, out: np.ndarray) -> None:
+        out[:, 0] = self.now.qpos[:, 0]
+        out[:, 1:5] = self.now.qpos[:, 2:]
+        np.clip(self.now.qvel, -10, 10, out=out[:, 5:11])
+        np.clip(self.now.constraint_forces, -10, 10, out=out[:, 11:17])
+        out[:, 17:] = self.now.center_of_mass
+
+
+class InvertedDoublePendulum(RllabVectorEnv):
+    """inverted_double_pendulum_env.py: keep two poles upright on a cart, paid 10 a step."""
+
+    env_id = "rllab/InvertedDoublePendulum-v0"
+    xml_file = "inverted_double_pendulum.xml"
+    frame_skip = 2
+    root = "cart"
+    observation_size = 11
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        spec.joint("slider").range = [-10, 10]
+        # The only asset without a camera that follows the robot.
+        spec.body("cart").add_camera(
+            name="track", mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, pos=[0, -3, 0.5], quat=[0.7071, 0.7071, 0, 0]
+        )
+
+    def views(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
+        return {**super().views(data), "tip": data.site_xpos[0], "constraint_forces": data.qfrc_constraint}
+
+    def draw_state(self, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        angle = np.deg2rad(40) * (generator.random() - 0.5)
+        return np.array([0, angle, 0]), np.zeros(3)
+
+    def reward(self) -> np.ndarray:
+        x, y = self.now.tip[:, 0], self.now.tip[:, 2]
+        rate, rate2 = self.now.qvel[:, 1], self.now.qvel[:, 2]
+        return 10 - 0.01 * x**2 - (y - 2) ** 2 - 1e-3 * rate**2 - 5e-3 * rate2**2
+
+    def terminated(self) -> np.ndarray:
+        return self.now.tip[:, 2] <= 1
+
+    def observe(self, out: np.ndarray) -> None:
+        out[:, 0] = self.now.qpos[:, 0]
+        np.sin(self.now.qpos[:, 1:], out=out[:, 1:3])
+        np.cos(self.now.qpos[:, 1:], out=out[:, 3:5])
+        np.clip(self.now.qvel, -10, 10, out=out[:, 5:8])
+        np.clip(self.now.constraint_forces, -10, 10, out=out[:, 8:])
+
+
+class Swimmer(RllabVectorEnv):
+    """swimmer_env.py: swim along x in the plane; no episode ends early. The position is part of the observation."""
+
+    env_id = "rllab/Swimmer-v0"
+    xml_file = "swimmer.xml"
+    frame_skip = 50
+    observation_size = 13
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        spec.option.timestep, spec.option.integrator = 0.001, EULER
+        spec.option.iterations = 1000
+        spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
+        for joint in spec.joints:
+            joint.armature = 0
+        set_motors(spec, [50, 50])
+
+    def reward(self) -> np.ndarray:
+        return self.now.velocity[:, 0] - self.control_cost(0.005)
+
+    def observe(self, out: np.ndarray) -> None:
+        out[:, :5] = self.now.qpos
+        out[:, 5:10] = self.now.qvel
+        out[:, 10:] = self.now.center_of_mass
+
+
+class Ant(RllabVectorEnv):
+    """ant_env.py: walk on four legs, with the contact forces on every body in view."""
+
+    env_id = "rllab/Ant-v0"
+    xml_file = "ant.xml"
+    observation_size = 125
+
+    def __init__(self, num_envs: int = 1, max_episode_steps: int | None = None, copy: bool = True, **options):
+        super().__init__(num_envs, max_episode_steps, copy, **options)
+        self.init_qpos = self.model.numeric("init_qpos").data.copy()  # crouching, as Gymnasium's Ant does not
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        spec.option.timestep = 0.02
+        for geom in spec.geoms:
+            geom.solimp[:3] = [0.8, 0.8, 0.01]
+        set_motors(spec, [150] * 8)
+
+    def views(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
+        orientation = data.xmat[self.model.body(self.root).id]
+        return {**super().views(data), "contact_forces": data.cfrc_ext, "orientation": orientation}
+
+    def draw_state(self, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        qpos, qvel = super().draw_state(generator)
+        qpos[3:7] /= np.linalg.norm(qpos[3:7])  # MuJoCo 1.31 did this in place
+        return qpos, qvel
+
+    def settle(self, data: mujoco.MjData) -> None:
+        super().settle(data)
+        mujoco.mj_rnePostConstraint(self.model, data)  # fills cfrc_ext, which mj_forward has not since MuJoCo 2.0
+
+    def reward(self) -> np.ndarray:
+        contact_cost = 0.5e-3 * np.sum(np.square(self.clipped_forces()), axis=1)
+        return self.now.velocity[:, 0] - self.control_cost(0.005) - contact_cost + 0.05
+
+    def terminated(self) -> np.ndarray:
+        height = self.now.qpos[:, 2]
+        finite = np.isfinite(self.now.qpos).all(axis=1) & np.isfinite(self.now.qvel).all(axis=1)
+        return ~(finite & (0.2 <= height) & (height <= 1.0))
+
+    def observe(self, out: np.ndarray) -> None:
+        out[:, :15] = self.now.qpos
+        out[:, 15:29] = self.now.qvel
+        out[:, 29:113] = self.clipped_forces()
+        out[:, 113:122] = self.now.orientation
+        out[:, 122:] = self.now.center_of_mass
+
+    def clipped_forces(self) -> np.ndarray:
+        """Torque and force of the contacts on each of the 14 bodies, the world first, clipped to [-1, 1], [n, 84]."""
+        return np.clip(self.now.contact_forces, -1, 1)
+
+
+class Hills:
+    """Mixin: the same robot, reward and observation on a landscape of hills, which the robot does not see.
+
+    Keywords `difficulty`, the height of the highest hills in metres, at least 0.05, and `terrain_seed`, the landscape.
+    """
+
+    @classmethod
+    def keywords(cls) -> dict:
+        return {**super().keywords(), "difficulty": 1.0, "terrain_seed": 0}
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        super().edit(spec)
+        add_terrain(spec, self.options.difficulty)
+
+    def load_model(self) -> mujoco.MjModel:
+        model = super().load_model()
+        # Written here because the compiler would stretch a landscape to fill the full range of heights.
+        model.hfield_data[:] = hills(self.options.terrain_seed).ravel()
+        return model
+
+
+class HalfCheetahHilly(Hills, HalfCheetah):
+    env_id = "rllab/HalfCheetahHilly-v0"
+
+
+class Walker2dHilly(Hills, Walker2d):
+    env_id = "rllab/Walker2dHilly-v0"
+
+
+class HopperHilly(Hills, Hopper):
+    env_id = "rllab/HopperHilly-v0"
+
+
+def swap_root_slides(spec: mujoco.MjSpec) -> None:
+    """Put the root's height before its x position, the order of rllab's walker and hopper."""
+    first, second = spec.joint("rootx"), spec.joint("rootz")
+    first.axis, second.axis = second.axis.copy(), first.axis.copy()
+    first.ref, second.ref = second.ref, first.ref
+    first.name, second.name = "swapped", "rootx"
+    first.name = "rootz"
+
+
+def set_motors(spec: mujoco.MjSpec, torques: list[float]) -> None:
+    """Let the controls be torques in N m, limited to `torques`, one for each motor."""
+    for motor, torque in zip(spec.actuators, torques, strict=True):
+        motor.gear[0] = 1
+        motor.ctrlrange = [-torque, torque]
+
+
 class RllabEnv(gym.Env):
     """One copy of a task, for `gym.make`, pictures and films.
 
@@ -212,4 +434,46 @@ class HalfCheetahEnv(RllabEnv):
     task = HalfCheetah
 
 
-TASKS = (HalfCheetahEnv,)
+class Walker2dEnv(RllabEnv):
+    task = Walker2d
+
+
+class HopperEnv(RllabEnv):
+    task = Hopper
+
+
+class InvertedDoublePendulumEnv(RllabEnv):
+    task = InvertedDoublePendulum
+
+
+class SwimmerEnv(RllabEnv):
+    task = Swimmer
+
+
+class AntEnv(RllabEnv):
+    task = Ant
+
+
+class HalfCheetahHillyEnv(RllabEnv):
+    task = HalfCheetahHilly
+
+
+class Walker2dHillyEnv(RllabEnv):
+    task = Walker2dHilly
+
+
+class HopperHillyEnv(RllabEnv):
+    task = HopperHilly
+
+
+TASKS = (
+    HalfCheetahEnv,
+    Walker2dEnv,
+    HopperEnv,
+    InvertedDoublePendulumEnv,
+    SwimmerEnv,
+    AntEnv,
+    HalfCheetahHillyEnv,
+    Walker2dHillyEnv,
+    HopperHillyEnv,
+)
