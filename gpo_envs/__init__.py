@@ -11,15 +11,13 @@ from gpo_envs import gymnasium_tasks, rllab
 
 HORIZON = 512  # steps per episode in the paper, section 4
 
-GYMNASIUM_TASKS = (gymnasium_tasks.HalfCheetahV4, gymnasium_tasks.HalfCheetahV5)
-
 
 def entry_point(creator: type) -> str:
     """The string by which Gymnasium's registry finds a class."""
     return f"{creator.__module__}:{creator.__name__}"
 
 
-for task in GYMNASIUM_TASKS:
+for task in gymnasium_tasks.TASKS:
     gym.spec(task.env_id).vector_entry_point = entry_point(task)
 
 for env in rllab.TASKS:

@@ -59,6 +59,7 @@ class MujocoVectorEnv(gym.vector.VectorEnv):
 
     env_id: str  # the registered id whose batched form this is
     frame_skip: int  # physics steps per environment step
+    constants: ClassVar[dict] = {}  # options that are no keywords of the task
 
     def __init__(self, num_envs: int = 1, max_episode_steps: int | None = None, copy: bool = True, **options):
         if num_envs < 1:
@@ -70,7 +71,7 @@ class MujocoVectorEnv(gym.vector.VectorEnv):
         self.num_envs = num_envs
         self.copy = copy
         self.render_mode = None
-        self.options = SimpleNamespace(**self._checked(options))
+        self.options = SimpleNamespace(**{**self.constants, **self._checked(options)})
 
         self.model = self.load_model()
         self.dt = self.model.opt.timestep * self.frame_skip
