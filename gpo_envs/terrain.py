@@ -2,28 +2,28 @@
 
 rllab (rllab/envs/mujoco/hill/terrain.py at ba78e4c) draws the hills as the maximum of Gaussian bumps, plots them with
 matplotlib and lets MuJoCo read the picture. What its tasks look like therefore depends on the plot's colours and
-margins: heights go through the red channel of the colour map, and one unit of the plot becomes 1.8 m. Both are kept
-here as numbers. Not kept are the page margin, which stood around the field as a wall, and the offset by which the plot
-missed the origin, so that a hopper started inside a hill.
+margins: a bump's height goes through the red channel of its colour, and one unit of the plot becomes 1.8 m. Both are
+kept here as numbers. Not kept are the steps of 1 cm between the plot's 100 layers, the page margin, which stood around
+the field as a wall, and the offset by which the plot missed the origin, so that a hopper started inside a hill.
 """
 
 import mujoco
 import numpy as np
 
 RADIUS = 40.0  # half the side of the square field, m
-CELLS = 501  # grid points along each side: 0.16 m apart, rllab's picture had 0.14 by 0.19
+CELLS = 557  # grid points along each side, 0.144 m apart as along x in rllab's picture
 UNIT = 1.8  # m per unit of rllab's plot
 PITCH = 40 / np.sqrt(500) * UNIT  # distance of neighbouring hills before they are moved, m
 JITTER = np.sqrt(0.4) * UNIT  # standard deviation of that move, m
 GROUND = -0.1  # height of the valley floor, m
 
-# Elevation, as a fraction of the highest possible, of density 0.4, 0.35, ... 0 of rllab's bumps: the red channel of
-# matplotlib's colour map "Greens", light for high ground.
+# The picture's levels of red, 0 to 255, where the bumps' density is 0, 0.05, ... 0.4: matplotlib's colour map "Greens",
+# light for high ground. MuJoCo reads them as elevations, from none to the highest.
 DENSITIES = np.linspace(0, 0.4, 9)
-ELEVATIONS = np.array([0, 0, 35, 65, 116, 161, 199, 229, 247]) / 255
+REDS = np.array([0, 0, 35, 65, 116, 161, 199, 229, 247])
 
 FLAT = 1.2  # half the side of the square around the start that is really flat, m
-SLOPE = 1.6  # width of the band around it over which the hills rise to their full height, m
+RIM = 1.6  # width of the band around it over which the hills rise to their full height, m
 
 
 def hills(seed: int) -> np.ndarray:
@@ -47,21 +47,19 @@ def hills(seed: int) -> np.ndarray:
         )
         bump = np.outer(along_y, along_x) / (2 * np.pi * variance)
         np.maximum(density[rows, columns], bump, out=density[rows, columns])
-    elevation = np.interp(density, DENSITIES, ELEVATIONS)
 
+    # The start is cleared before the heights are looked up, as in rllab: its rim is the steepest place of the field.
     distance = np.maximum(*np.abs(np.meshgrid(axis, axis)))
-    rise = np.clip((distance - FLAT) / SLOPE, 0, 1)
-    return elevation * rise**2 * (3 - 2 * rise)
+    rise = np.clip((distance - FLAT) / RIM, 0, 1)
+    density *= rise**2 * (3 - 2 * rise)
+    return np.interp(density, DENSITIES, REDS) / 255
 
 
 def add_terrain(spec: mujoco.MjSpec, difficulty: float) -> None:
     """Replace the floor by a field of heights up to `difficulty` metres; they are to be written after compiling.
 
-    Raises:
-        ValueError: if the difficulty is negative.
+    As in rllab, no difficulty is below 0.05.
     """
-    if difficulty < 0:
-        raise ValueError(f"difficulty must not be negative, got {difficulty}")
     height = max(difficulty, 0.05)
     placeholder = np.zeros(CELLS * CELLS)
     spec.add_hfield(name="hills", nrow=CELLS, ncol=CELLS, size=[RADIUS, RADIUS, height, 0.1], userdata=placeholder)
