@@ -88,7 +88,8 @@ class RllabVectorEnv(MujocoVectorEnv):
         np.multiply(self._actions, self._motor_range, out=self.controls)
         self.advance()
         self.gather()
-        return self.reward(), self.terminated() | self.diverged()
+        terminated, diverged = self.terminated(), self.diverged()
+        return self.reward(), terminated if diverged is None else terminated | diverged
 
     def advance(self) -> None:
         """Simulate `frame_skip` physics steps in every copy, then bring all derived quantities up to date.
@@ -409,7 +410,7 @@ class RllabEnv(gym.Env):
         if action.shape != self.action_space.shape:
             raise ValueError(f"expected an action of shape {self.action_space.shape}, got {action.shape}")
         rewards, terminations = self._copies.transition(action[None])
-        info = {"diverged": True} if self._copies.diverged()[0] else {}
+        info = {} if self._copies.diverged() is None else {"diverged": True}
         if self.render_mode == "human":
             self.render()
         return self._observation(), float(rewards[0]), bool(terminations[0]), False, info

@@ -169,10 +169,10 @@ class MujocoVectorEnv(gym.vector.VectorEnv):
         data.qpos[:], data.qvel[:] = self.draw_state(generator)
         self.settle(data)
 
-    def diverged(self) -> np.ndarray:
-        """Which copies MuJoCo found diverging since their last reset, [n], bool."""
+    def diverged(self) -> np.ndarray | None:
+        """Which copies MuJoCo found diverging since their last reset, [n], bool; None, as a rule, if there are none."""
         np.concatenate(self._warning_sources, out=self._warnings_flat)
-        return self._warnings.any(axis=1)
+        return self._warnings.any(axis=1) if self._warnings_flat.any() else None
 
     # ---- Gymnasium's interface --------------------------------------------------------------------------------------
 
@@ -232,7 +232,7 @@ class MujocoVectorEnv(gym.vector.VectorEnv):
 
         infos = {}
         diverged = self.diverged()
-        if diverged.any():
+        if diverged is not None:
             infos["diverged"], infos["_diverged"] = diverged, diverged.copy()
         ended = terminations | truncations
         if ended.any():
