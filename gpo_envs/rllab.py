@@ -212,7 +212,8 @@ class InvertedDoublePendulum(RllabVectorEnv):
 
     def edit(self, spec: mujoco.MjSpec) -> None:
         spec.joint("slider").range = [-10, 10]
-        # The only asset without a camera that follows the robot.
+        # The only asset without a light, and without a camera that follows the robot.
+        spec.worldbody.add_light(pos=[0, -1, 3], dir=[0, 0.3, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
         spec.body("cart").add_camera(
             name="track", mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, pos=[0, -3, 0.5], quat=[0.7071, 0.7071, 0, 0]
         )

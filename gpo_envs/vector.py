@@ -110,7 +110,7 @@ class MujocoVectorEnv(gym.vector.VectorEnv):
         raise NotImplementedError
 
     def views(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
-        """The arrays of one copy's memory that the task looks at; `self.now.<name>` holds them for all copies, [n, size]."""
+        """The arrays of one copy's memory that the task looks at; `self.now.<name>` has them for all, [n, size]."""
         return {"qpos": data.qpos, "qvel": data.qvel}
 
     def draw_state(self, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -118,7 +118,7 @@ class MujocoVectorEnv(gym.vector.VectorEnv):
         raise NotImplementedError
 
     def transition(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Advance all copies under `actions` [n, action_dim]; returns rewards [n], float64, and terminations [n], bool."""
+        """Advance all copies under `actions` [n, action_dim]; returns rewards [n] and terminations [n], bool."""
         raise NotImplementedError
 
     def observe(self, out: np.ndarray) -> None:
