@@ -2,6 +2,7 @@
 # requires-python = ">=3.11"
 # dependencies = [
 #     "torch==2.13.0",
+#     "numpy==2.4.6",
 #     "gymnasium[mujoco]==1.4.0",
 #     "mujoco==4.0.0",
 #     "tyro==1.0.17",
@@ -12,34 +13,30 @@
 # ///
 """Genetic Policy Optimization with PPO mutation (Gangwani & Peng, ICLR 2018, https://arxiv.org/abs/1711.01012).
 
-    python gpo_ppo.py --env-id HalfCheetah-v4 --population 8
-
-A population of Gaussian MLP policies repeats three operators (Algorithm 1): `mutate` improves every policy with PPO and
-lets similar policies share their batches; `select` picks the fittest couples; `crossover` distils each couple into a child.
-Notes and results: docs/gpo.md.
+A population of Gaussian MLP policies repeats three operators (Algorithm 1): mutate improves every policy with PPO and lets
+similar policies share their batches; select picks the fittest couples; crossover distils each couple into a child.
+Example: python gpo_ppo.py --env-id HalfCheetah-v4 --population 8
 """
 
 import ctypes
 import fcntl
-import io
 import json
 import math
 import os
 import signal
-import socket
 import sys
 import time
 import warnings
 import zlib
 from collections import deque
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields
 from importlib.metadata import version
 from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Literal
+from typing import Annotated, Literal
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # nets this small lose with threads; ranks are the parallelism
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # nets this small lose with threads; workers are the parallelism
 import gymnasium as gym
 import numpy as np
 import torch
@@ -47,17 +44,28 @@ import torch.distributed as dist
 import tyro
 from gymnasium.vector import AutoresetMode
 
-# ---------------------------------------------------------------- flags
+try:
+    import gpo_envs  # registers rllab's tasks and batched stepping
+except ModuleNotFoundError as missing:
+    if missing.name != "gpo_envs":
+        raise
+    gpo_envs = None
+
+# ---------------------------------------------------------------- flags; an annotation is the bound that `parse_args` checks
+
+SCRIPT = {}  # what tells this script from its siblings; filled next to the functions that it names, used by `main`
 
 
 @dataclass
 class Experiment:
-    exp_name: str = Path(__file__).stem
-    """the name of this experiment, part of the run's name"""
-    seed: int = 1
+    exp_name: str | None = None
+    """the name of this experiment, part of the run's name; default: the script's"""
+    seed: Annotated[int, ">= 0"] = 1
     """the seed from which every random number of the run follows"""
-    workers: int | None = None
+    workers: Annotated[int | None, "> 0"] = None
     """processes that share the work; default: one per core this process may use, at most one per member"""
+    max_restarts: Annotated[int, ">= 0"] = 3
+    """how often a crashed group of workers starts again from the last checkpoint (with more than one worker)"""
     cuda: bool = False
     """whether to compute updates on the accelerator (worker r uses device r modulo their number)"""
     run_dir: str = "runs"
@@ -66,8 +74,6 @@ class Experiment:
     """the name of this run's folder; default: {env_id}__{exp_name}__{seed}__{unix time}"""
     resume: str | None = None
     """the folder of a run that stopped: go on from its last checkpoint, with its flags"""
-    max_restarts: int = 3
-    """how often a crashed worker group is restarted from the last checkpoint (more than one worker only)"""
     track: bool = False
     """whether to send everything that is logged to Weights & Biases, too"""
     wandb_project_name: str = "gpo"
@@ -81,58 +87,62 @@ class Environment:
     env_id: str = "HalfCheetah-v4"
     """the id of any Gymnasium environment with Box observations and Box actions"""
     env_kwargs: str = "{}"
-    """keyword arguments of the environment, as JSON"""
-    max_episode_steps: int | None = None
+    """keyword arguments of the environment, as a JSON object"""
+    max_episode_steps: Annotated[int | None, "> 0"] = None
     """the horizon, in steps; default: the smaller of 512 (the paper's) and the environment's own"""
     vectorization: Literal["auto", "sync"] = "auto"
     """auto: batched stepping where gpo_envs serves the id; sync: always Gymnasium's SyncVectorEnv"""
-    num_envs: int = 4
+    num_envs: Annotated[int, "> 0"] = 4
     """the number of environments per member"""
-    num_steps: int = 512
+    num_steps: Annotated[int, "> 0"] = 512
     """the number of steps in each environment per iteration; a member's batch is num_envs * num_steps"""
 
 
 @dataclass
 class Budget:
-    total_timesteps: int = 8_000_000
-    """environment steps of the whole population together, those of DAgger included; never exceeded"""
-    population: int = 8
-    """the number of policies, m in the paper"""
-    rounds: int = 12
+    total_timesteps: Annotated[int, "> 0"] = 8_000_000
+    """environment steps of the whole run, all members and all phases of training together; never exceeded"""
+    population: Annotated[int, "> 0"] = 8
+    """the number of members, m in the paper"""
+
+
+@dataclass
+class Rounds:
+    rounds: Annotated[int, "> 0"] = 12
     """rounds of mutate, select and crossover; as many as fit into the budget"""
 
 
 @dataclass
-class Mutate:
-    learning_rate: float = 3e-3
+class PolicyGradient:
+    learning_rate: Annotated[float, "> 0"] = 3e-3
     """Adam's learning rate of the policies"""
-    critic_learning_rate: float = 1e-3
+    critic_learning_rate: Annotated[float, "> 0"] = 1e-3
     """Adam's learning rate of the critics"""
-    gamma: float = 0.99
+    gamma: Annotated[float, "in [0, 1]"] = 0.99
     """the discount factor"""
-    gae_lambda: float = 0.95
+    gae_lambda: Annotated[float, "in [0, 1]"] = 0.95
     """the lambda of generalized advantage estimation"""
     norm_adv: bool = True
-    """whether advantages are normalized to mean 0 and deviation 1 over each batch"""
+    """whether advantages are normalized to mean 0 and deviation 1 over the batch of a gradient step"""
     norm_obs: bool = True
     """whether observations are normalized by running statistics, which are part of the policy"""
     norm_returns: bool = True
     """whether the critic's targets are divided by a slowly moving root mean square of the returns"""
-    critic_epochs: int = 10
+    critic_epochs: Annotated[int, "> 0"] = 10
     """passes of the critic over each batch"""
-    critic_minibatch_size: int = 256
-    """samples per gradient step of the critic"""
+    critic_minibatch_size: Annotated[int, "> 0"] = 256
+    """samples per member and gradient step of the critic"""
 
 
 @dataclass
 class PPO:
-    update_epochs: int = 10
-    """full-batch gradient steps of the policy per iteration"""
-    kl_coef: float = 1.0
-    """the initial weight of the KL penalty, beta in the paper; it adapts to kl_target"""
-    kl_target: float = 0.01
-    """the KL per iteration that beta aims at: doubled above 1.5 times, halved below 1/1.5 of it"""
-    kl_hinge: float = 100.0
+    update_epochs: Annotated[int, "> 0"] = 10
+    """full-batch gradient steps of the policy per iteration of PPO"""
+    kl_coef: Annotated[float, "> 0"] = 1.0
+    """the initial weight of PPO's KL penalty, beta in the paper; it adapts to kl_target"""
+    kl_target: Annotated[float, "> 0"] = 0.01
+    """the KL per iteration (nats) that beta aims at: doubled above 1.5 times, halved below 1/1.5 of it"""
+    kl_hinge: Annotated[float, ">= 0"] = 100.0
     """the weight of the additional penalty max(0, KL - 2 kl_target)^2; 0 is the paper's loss"""
 
 
@@ -140,9 +150,9 @@ class PPO:
 class Sharing:
     data_sharing: bool = True
     """whether similar policies share their batches (M in the paper's ablation)"""
-    kl_sharing_threshold: float = 0.5
+    kl_sharing_threshold: Annotated[float, ">= 0"] = 0.5
     """policy i borrows from j if KL[i, j] was below this (nats) at the start of the round, epsilon in the paper"""
-    importance_clip: float = 2.0
+    importance_clip: Annotated[float, "> 0 or inf"] = 1.0
     """the cap of borrowed samples' importance ratios; inf is the paper's gradient"""
 
 
@@ -152,45 +162,49 @@ class Select:
     """which couples breed: the fittest, or random ones (S in the paper's ablation)"""
     fitness: Literal["performance", "diversity", "mixture"] = "performance"
     """the fitness of a couple: sum of returns, symmetrized KL, or both as z-scores"""
-    diversity_weight: float = 0.5
+    diversity_weight: Annotated[float, "in [0, 1]"] = 0.5
     """the weight of the KL in the mixture in round one; it falls linearly to 0 in the last round"""
 
 
 @dataclass
 class Crossover:
     crossover: Literal["state-space", "copy", "parameter"] = "state-space"
-    """how two parents make a child: distillation (C in the paper's ablation), copy of the stronger, random weights"""
-    crossover_pool: int = 8192
+    """how a couple makes a child: distillation (C in the paper's ablation), copy of the stronger, random weights"""
+    crossover_pool: Annotated[int, "> 0"] = 8192
     """the most recent transitions per parent from which pi_S is learned"""
-    crossover_top: float = 0.6
-    """the fraction of the parents' trajectories, best first, that pi_S learns from"""
-    crossover_learning_rate: float = 5e-4
+    crossover_top: Annotated[float, "in [0, 1]"] = 0.6
+    """the fraction of both parents' trajectories, best first, that pi_S learns from"""
+    crossover_learning_rate: Annotated[float, "> 0"] = 5e-4
     """Adam's learning rate of pi_S and of the distillation"""
-    crossover_minibatch_size: int = 64
+    crossover_minibatch_size: Annotated[int, "> 0"] = 64
     """samples per gradient step of pi_S and of the distillation"""
-    pi_s_epochs: int = 100
+    pi_s_epochs: Annotated[int, "> 0"] = 100
     """passes of pi_S over its data"""
-    expert_steps: int = 5000
+    expert_steps: Annotated[int, ">= 10"] = 5000
     """transitions of the two-headed expert pi_H per child, from ten environments"""
-    student_steps: int = 500
-    """transitions of the student per DAgger iteration"""
-    dagger_iterations: int = 10
+    student_steps: Annotated[int, "> 0"] = 500
+    """transitions of the student per iteration of DAgger"""
+    dagger_iterations: Annotated[int, ">= 0"] = 10
     """iterations of DAgger after the first fit to the expert's transitions"""
-    dagger_epochs: int = 10
-    """passes over the aggregated data per DAgger iteration"""
-    critic_warmup: int = 2
+    dagger_epochs: Annotated[int, "> 0"] = 10
+    """passes over the aggregated data per iteration of DAgger"""
+    critic_warmup: Annotated[int, ">= 0"] = 2
     """iterations after a crossover that fit only the critic"""
     save_crossovers: bool = False
     """whether to keep parents and children of every round, not only of the first (crossover_001.pt)"""
 
 
 @dataclass
-class Evaluation:
-    comparison_episodes: int = 5
+class Comparison:
+    comparison_episodes: Annotated[int, "> 0"] = 5
     """episodes by which children are compared with their parents after each crossover; outside the budget"""
-    selection_episodes: int = 20
+
+
+@dataclass
+class Evaluation:
+    selection_episodes: Annotated[int, "> 0"] = 20
     """episodes per member at the end that choose the best member; outside the budget"""
-    report_episodes: int = 100
+    report_episodes: Annotated[int, "> 0"] = 100
     """episodes per member at the end, on other seeds, that are reported; outside the budget"""
 
 
@@ -199,35 +213,84 @@ class Args:
     experiment: Experiment = field(default_factory=Experiment)
     environment: Environment = field(default_factory=Environment)
     budget: Budget = field(default_factory=Budget)
-    mutate: Mutate = field(default_factory=Mutate)
+    rounds: Rounds = field(default_factory=Rounds)
+    mutate: PolicyGradient = field(default_factory=PolicyGradient)
     ppo: PPO = field(default_factory=PPO)
     sharing: Sharing = field(default_factory=Sharing)
     select: Select = field(default_factory=Select)
     crossover: Crossover = field(default_factory=Crossover)
+    comparison: Comparison = field(default_factory=Comparison)
     evaluation: Evaluation = field(default_factory=Evaluation)
+
+
+BOUNDS = {
+    "> 0": lambda x: 0 < x < math.inf,
+    ">= 0": lambda x: 0 <= x < math.inf,
+    ">= 10": lambda x: x >= 10,
+    "> 0 or inf": lambda x: x > 0,
+    "in [0, 1]": lambda x: 0 <= x <= 1,
+}
+MAY_CHANGE_ON_RESUME = "workers max_restarts cuda run_dir run_name resume track wandb_project_name wandb_entity".split()
 
 
 def refuse(message):
     """Ends the program for bad input: one line on stderr, exit code 2."""
-    print(f"{Path(__file__).name}: error: {message}", file=sys.stderr, flush=True)
+    print(f"{Path(sys.argv[0]).name}: error: {message}", file=sys.stderr, flush=True)
     raise SystemExit(2)
 
 
-def flatten(args):
-    """All flags in one namespace: args.seed, not args.experiment.seed."""
-    return SimpleNamespace(**{name: value for group in vars(args).values() for name, value in vars(group).items()})
+def parse_args(argv):
+    """All flags in one namespace (args.seed, not args.experiment.seed), checked; a resumed run's come from its checkpoint.
 
+    Adds what follows from them: flags (the plain values), obs_dim, act_dim, the horizon, workers, the run's name, plan.
+    """
 
-def unflatten(flags):
-    """The inverse of `flatten`, from a dict."""
-    return Args(**{f.name: f.type(**{g.name: flags[g.name] for g in fields(f.type)}) for f in fields(Args)})
+    def parse(default=None):
+        groups = tyro.cli(Args, args=argv, default=default, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
+        return SimpleNamespace(**{name: x for group in vars(groups).values() for name, x in vars(group).items()})
+
+    args = parse()
+    if args.resume:
+        stored = load_checkpoint(args.resume)["flags"]
+        args = parse(Args(**{f.name: f.type(**{g.name: stored[g.name] for g in fields(f.type)}) for f in fields(Args)}))
+        for name, value in vars(args).items():
+            if name not in MAY_CHANGE_ON_RESUME and value != stored[name]:
+                refuse(f"--{name.replace('_', '-')} {value}: the run was started with {stored[name]}, which cannot change")
+        folder = Path(args.resume).absolute()
+        args.run_dir, args.run_name = str(folder.parent), folder.name
+    args.flags = dict(vars(args), resume=None)
+
+    for group in fields(Args):
+        for flag in fields(group.type):
+            value, bounds = getattr(args, flag.name), getattr(flag.type, "__metadata__", ())
+            if value is not None and not all(BOUNDS[bound](value) for bound in bounds):
+                refuse(f"--{flag.name.replace('_', '-')} {value}: must be {bounds[0]}")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    args.workers = args.workers or min(cores, args.population)
+    if args.workers > args.population:
+        refuse(f"--workers {args.workers}: more than --population {args.population}; a worker needs at least one member")
+    if args.cuda and not torch.cuda.is_available():
+        refuse("--cuda: PyTorch sees no CUDA device here; leave the flag out to run on the CPU")
+    check_environment(args)
+    args.plan, args.budget_steps = SCRIPT["plan"](args)
+    if not args.exp_name:
+        args.exp_name = Path(__file__).stem.removesuffix("_baseline") + (f"_{args.algo}" if hasattr(args, "algo") else "")
+    if not args.run_name:
+        args.run_name = f"{args.env_id.replace('/', '-')}__{args.exp_name}__{args.seed}__{int(time.time())}"
+    try:
+        (Path(args.run_dir) / args.run_name).mkdir(parents=True, exist_ok=True)
+        with open(Path(args.run_dir) / args.run_name / ".lock", "a"):
+            pass
+    except OSError as error:
+        refuse(f"--run-dir {args.run_dir}: {error.strerror} ({error.filename})")
+    return args
 
 
 # ---------------------------------------------------------------- randomness
 
 
 def rng(seed, purpose, *indices):
-    """A generator of its own for each use, e.g. rng(1, "noise", round, iteration, member).
+    """A generator of its own for each use, e.g. rng(1, "noise", generation, iteration, member).
 
     No stream is shared, so results depend neither on the number of workers nor on what ran before a checkpoint.
     """
@@ -239,34 +302,56 @@ def env_seeds(num_envs, seed, purpose, *indices):
     return rng(seed, purpose, *indices).integers(2**31, size=num_envs).tolist()
 
 
+def normal_noise(generators, num_steps, num_envs, act_dim):
+    """Standard normal numbers [steps, members, envs, act_dim], each member's from its own generator."""
+    return np.stack([g.standard_normal((num_steps, num_envs, act_dim), np.float32) for g in generators], axis=1)
+
+
+def shuffles(generators, samples, epochs, device):
+    """Indices [members, epochs * samples]: a new order of a member's samples for each epoch."""
+    orders = [np.concatenate([g.permutation(samples) for _ in range(epochs)]) for g in generators]
+    return torch.from_numpy(np.stack(orders)).to(device)
+
+
 # ---------------------------------------------------------------- environments
 
-try:
-    import gpo_envs  # noqa: F401  registers rllab's tasks and batched stepping
-except ModuleNotFoundError as missing:
-    if missing.name != "gpo_envs":
-        raise
-    gpo_envs = None
+
+def check_environment(args):
+    """Makes the environment once: refuses what a Gaussian policy cannot play, and sets obs_dim, act_dim, the horizon."""
+    try:
+        kwargs = json.loads(args.env_kwargs)
+    except ValueError:
+        kwargs = None
+    if not isinstance(kwargs, dict):
+        refuse(f"--env-kwargs {args.env_kwargs!r}: must be a JSON object, such as '{{\"difficulty\": 0.5}}'")
+    try:
+        own_limit = gym.spec(args.env_id).max_episode_steps
+        args.max_episode_steps = args.max_episode_steps or min(512, own_limit or 512)
+        envs = make_envs(args, 1)
+    except Exception as error:  # whatever is raised here is about the id or its keywords
+        refuse(f"--env-id {args.env_id} --env-kwargs '{args.env_kwargs}': {' '.join(str(error).split())}")
+    for name, space in (("action", envs.single_action_space), ("observation", envs.single_observation_space)):
+        if not isinstance(space, gym.spaces.Box):
+            refuse(f"--env-id {args.env_id}: its {name} space is {space}; only Box is supported")
+    args.obs_dim = math.prod(envs.single_observation_space.shape)
+    args.act_dim = math.prod(envs.single_action_space.shape)
+    envs.close()
 
 
 def make_envs(args, num_envs):
     """`num_envs` environments with SAME_STEP autoreset: batched where gpo_envs serves the id, else SyncVectorEnv.
 
-    Under `--vectorization sync` is the place for wrappers of your own.
+    `--vectorization sync` always takes the latter, which is the place for wrappers of your own.
     """
-    kwargs = json.loads(args.env_kwargs)
-    if args.max_episode_steps:
-        kwargs["max_episode_steps"] = args.max_episode_steps
+    kwargs = {"max_episode_steps": args.max_episode_steps, **json.loads(args.env_kwargs)}
     served = str(gym.spec(args.env_id).vector_entry_point).startswith("gpo_envs")
+    if not (served and args.vectorization == "auto"):
+        kwargs |= {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": AutoresetMode.SAME_STEP}}
     with warnings.catch_warnings():
         # Gymnasium calls v4 tasks out of date and MuJoCo warns of settotalmass in its XML, once per environment.
         warnings.filterwarnings("ignore", message=".*out of date.*")
         warnings.filterwarnings("ignore", message=".*settotalmass.*")
-        if served and args.vectorization == "auto":
-            envs = gym.make_vec(args.env_id, num_envs, **kwargs)
-        else:
-            vector_kwargs = {"autoreset_mode": AutoresetMode.SAME_STEP}
-            envs = gym.make_vec(args.env_id, num_envs, vectorization_mode="sync", vector_kwargs=vector_kwargs, **kwargs)
+        envs = gym.make_vec(args.env_id, num_envs, **kwargs)
     assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
     return envs
 
@@ -276,7 +361,7 @@ def rollout(envs, obs, act, num_steps):
 
     act(obs [envs, obs_dim], t) returns actions [envs, act_dim]; they are clipped to the Box for the environment only.
     Returns time-major arrays: obs, next_obs (the true successor, final_obs at an end), actions, rewards, terminations,
-    truncations, and the next iteration's first `obs`; `diverged` [envs] marks simulations that blew up.
+    truncations, dones; last_obs, with which to go on; diverged [envs], simulations that blew up.
     """
     num_envs, obs_dim = obs.shape
     space = envs.single_action_space
@@ -308,22 +393,27 @@ def rollout(envs, obs, act, num_steps):
 
 
 def finished_episodes(open_episodes, data):
-    """Cuts a roll-out at the ends of episodes. Returns per environment the episodes that ended, as (obs [L, d], return).
+    """Cuts a roll-out at the ends of episodes; returns per environment those that ended, as (obs [L, obs_dim], return).
 
-    open_episodes: per environment a list of [obs, return] pieces that earlier roll-outs left open; updated in place.
+    open_episodes: per environment a list of (obs, return) pieces that earlier roll-outs left open; updated in place.
     """
     finished = []
     for e, pieces in enumerate(open_episodes):
         episodes, start = [], 0
         for end in np.flatnonzero(data.dones[:, e]) + 1:
             pieces.append((data.obs[start:end, e], data.rewards[start:end, e].sum()))
-            episodes.append((np.concatenate([p[0] for p in pieces]), float(sum(p[1] for p in pieces))))
+            episodes.append(join_pieces(pieces))
             pieces.clear()
             start = end
         if start < len(data.obs):
             pieces.append((data.obs[start:, e], data.rewards[start:, e].sum()))
         finished.append(episodes)
     return finished
+
+
+def join_pieces(pieces):
+    """One episode (obs [L, obs_dim], return) from its pieces."""
+    return np.concatenate([obs for obs, _ in pieces]), float(sum(ret for _, ret in pieces))
 
 
 # ---------------------------------------------------------------- networks: stacks of MLPs, one row of a flat buffer each
@@ -338,19 +428,19 @@ def critic_sizes(args):
 
 
 def make_net(flat, sizes, log_std=False, grad=None):
-    """Views into a stack of MLPs and its gradient, flat [members, P].
+    """Views into a stack of MLPs, flat [members, P], and its gradient.
 
     Per layer (W [members, out, in], b [members, out, 1]) and the same of the gradient; log_std [members, act_dim, 1];
-    rows: each member as a stack of one that shares the same memory.
+    rows: each member as a stack of one in the same memory.
     """
     net = SimpleNamespace(flat=flat, grad=torch.zeros_like(flat) if grad is None else grad, layers=[], sizes=sizes)
     at = 0
     for n_in, n_out in zip(sizes, sizes[1:]):
-        W = [x[:, at : at + n_out * n_in].view(-1, n_out, n_in) for x in (net.flat, net.grad)]
+        W, W_grad = (x[:, at : at + n_out * n_in].view(-1, n_out, n_in) for x in (net.flat, net.grad))
         at += n_out * n_in
-        b = [x[:, at : at + n_out, None] for x in (net.flat, net.grad)]
+        b, b_grad = (x[:, at : at + n_out, None] for x in (net.flat, net.grad))
         at += n_out
-        net.layers.append((W[0], b[0], W[1], b[1]))
+        net.layers.append((W, b, W_grad, b_grad))
     if log_std:
         net.log_std, net.log_std_grad = (x[:, at : at + sizes[-1], None] for x in (net.flat, net.grad))
     members = range(len(flat)) if len(flat) > 1 else ()
@@ -363,9 +453,9 @@ def make_policy(flat, args):
 
 
 def init_rows(generators, sizes, output_std, log_std=False):
-    """Orthogonally initialized MLPs, one row [P] per generator; log-std 0.
+    """Orthogonally initialized MLPs [members, P], one per generator; biases and log-std 0.
 
-    P is padded to a multiple of 16: vectorized kernels then treat a member alike wherever its row stands.
+    P is padded to a multiple of 16, so that vectorized kernels treat a member alike wherever its row stands.
     """
     count = sum(n_out * n_in + n_out for n_in, n_out in zip(sizes, sizes[1:])) + log_std * sizes[-1]
     flat = torch.zeros(len(generators), math.ceil(count / 16) * 16)
@@ -378,66 +468,73 @@ def init_rows(generators, sizes, output_std, log_std=False):
     return flat
 
 
+def tanh_(x):
+    """tanh in place; on the CPU NumPy's is several times faster than torch's."""
+    return x.tanh_() if x.is_cuda else torch.from_numpy(np.tanh(x.numpy(), out=x.numpy()))
+
+
 def forward(net, x):
-    """All layers' activations [x, h1, h2, output] of a stack; x is [members, in, samples], columns are samples."""
+    """Activations [x, h1, h2, output] of a stack; x is [members, in, samples]: columns are samples, as in Wx + b."""
     activations = [x]
     for W, b, *_ in net.layers[:-1]:
-        # tanh(z) = 2 sigmoid(2 z) - 1; the CPU's sigmoid is several times faster than its tanh.
-        h = torch.baddbmm(b, W, activations[-1], beta=2, alpha=2).sigmoid_()
-        activations.append(h.mul_(2).sub_(1))
+        activations.append(tanh_(torch.baddbmm(b, W, activations[-1])))
     W, b, *_ = net.layers[-1]
-    activations.append(torch.baddbmm(b, W, activations[-1]))
-    return activations
+    return [*activations, torch.baddbmm(b, W, activations[-1])]
 
 
 def backward(net, activations, grad):
     """Adds to net.grad the gradient of a loss whose derivative with respect to the output is grad [members, out, samples].
 
-    Written out because autograd's bookkeeping costs more than these small products: dW = g h^T, db = sum g,
-    and through tanh g <- W^T g * (1 - h^2).
+    Written out, since autograd's bookkeeping costs more than these small products: with h the input of a layer,
+    dW = grad h^T, db = sum of grad; and below, through W and tanh, grad <- (W^T grad) (1 - h^2).
     """
     for (W, _, W_grad, b_grad), h in zip(reversed(net.layers), reversed(activations[:-1])):
-        W_grad.baddbmm_(grad, h.mT)
+        W_grad.add_(torch.bmm(grad, h.mT))
         b_grad.add_(grad.sum(-1, keepdim=True))
         if h is not activations[0]:
-            grad = torch.ops.aten.tanh_backward(torch.bmm(W.mT, grad), h)
+            grad = torch.bmm(W.mT, grad)
+            grad.addcmul_(grad * h, h, value=-1)
 
 
-def adam(net, learning_rate):
-    """Adam over a stack; it works element by element, so members do not mix."""
-    net.flat.grad = net.grad
-    return torch.optim.Adam([net.flat], lr=learning_rate, eps=1e-5, fused=True)
+def adam(net):
+    """Gives a stack fresh moments for `adam_step`."""
+    net.moments = torch.zeros_like(net.flat), torch.zeros_like(net.flat), torch.zeros(())
 
 
-def fit(net, optimizer, rows, output_gradient, indices, minibatch_size):
-    """Minibatch gradient descent of a stack.
+def adam_step(net, learning_rate):
+    """One step of Adam (https://arxiv.org/abs/1412.6980) by net.grad; element by element, so members do not mix.
+
+    This is the kernel of torch.optim.Adam(fused=True); the class around it costs several times the kernel here.
+    """
+    mean, square, step = net.moments
+    torch._fused_adam_(
+        *([net.flat], [net.grad], [mean], [square], [], [step.add_(1)]),
+        **dict(lr=learning_rate, beta1=0.9, beta2=0.999, eps=1e-5, weight_decay=0.0, amsgrad=False, maximize=False),
+    )
+
+
+def fit(net, rows, output_gradient, indices, minibatch_size, step):
+    """Minibatch gradient descent of a stack; step() uses net.grad.
 
     rows [members, samples, in + targets]; indices [members, steps * minibatch_size] of samples, in their order of use;
     output_gradient(output [members, out, minibatch], targets [members, targets, minibatch]) is the loss's derivative.
     """
     members, samples, width = rows.shape
-    n_in = net.sizes[0]
-    flat_rows = rows.reshape(members * samples, width)
+    flat_rows, n_in = rows.reshape(members * samples, width), net.sizes[0]
     indices = indices + samples * torch.arange(members, device=rows.device)[:, None]
     for chunk in indices.split(minibatch_size, dim=1):
         batch = flat_rows.index_select(0, chunk.reshape(-1)).view(members, -1, width).mT
-        net.grad.zero_()
         activations = forward(net, batch[:, :n_in])
+        net.grad.zero_()
         backward(net, activations, output_gradient(activations[-1], batch[:, n_in:]))
-        optimizer.step()
-
-
-def shuffles(generators, samples, epochs, device):
-    """Indices [members, epochs * samples]: a new order of a member's samples for each epoch."""
-    orders = [np.concatenate([g.permutation(samples) for _ in range(epochs)]) for g in generators]
-    return torch.from_numpy(np.stack(orders)).to(device)
+        step()
 
 
 # ---------------------------------------------------------------- Gaussian policies
 
 
 def gaussian_log_prob(actions, mean, log_std):
-    """log pi(a|s) [members, samples]."""
+    """log pi(a|s) [members, samples] of actions and mean [members, act_dim, samples]."""
     z = (actions - mean) * torch.exp(-log_std)
     return -0.5 * z.square().sum(1) - log_std.sum(1) - 0.5 * mean.shape[1] * math.log(2 * math.pi)
 
@@ -449,14 +546,22 @@ def gaussian_kl(mean_p, log_std_p, mean_q, log_std_q):
     return (0.5 * (var_ratio + squares - 1) + log_std_q - log_std_p).sum(1)
 
 
+def policy_kl(policy, batch):
+    """Mean KL[old, new] of one member over the states of its batch."""
+    return gaussian_kl(batch.mean, batch.log_std, forward(policy, batch.obs)[-1], policy.log_std).mean().item()
+
+
 def normalize(obs, stats):
-    """Observations as policies see them; obs [..., members, samples, obs_dim] with statistics [members, obs_dim]."""
+    """Observations as networks see them; obs [..., members, samples, obs_dim] with statistics [members, obs_dim]."""
     return np.clip((obs - stats.mean[:, None]) * stats.inv_std[:, None], -10, 10)
 
 
-def row_of(stats, i):
-    """Member i's statistics, as a stack of one."""
-    return SimpleNamespace(**{name: x[i : i + 1] for name, x in vars(stats).items()})
+def net_output(net, obs):
+    """A stack's outputs [members, samples, out], for NumPy observations [members, samples, obs_dim], normalized."""
+    x = torch.from_numpy(obs).to(net.flat.device).mT
+    if x.shape[2] == 1:  # a product with a single column takes another route, whose rounding depends on the stack's size
+        return net_output(net, np.repeat(obs, 2, axis=1))[:, :1]
+    return forward(net, x)[-1].mT.cpu().numpy()
 
 
 def sample_actions(policy, stats, noise):
@@ -467,37 +572,23 @@ def sample_actions(policy, stats, noise):
     members, std = len(policy.flat), policy.log_std.exp().mT.cpu().numpy()
 
     def act(obs, t):
-        mean = policy_mean(policy, normalize(obs.reshape(members, -1, obs.shape[-1]), stats))
+        mean = net_output(policy, normalize(obs.reshape(members, -1, obs.shape[-1]), stats))
         return (mean if noise is None else mean + std * noise[t]).reshape(len(obs), -1)
 
     return act
 
 
-def policy_mean(net, obs):
-    """A stack's outputs [members, envs, out] for a step's normalized observations [members, envs, obs_dim]."""
-    x = torch.from_numpy(obs).to(net.flat.device).mT
-    if x.shape[2] == 1:  # a product with one column takes another route, whose rounding depends on the stack's size
-        return forward(net, x.expand(-1, -1, 2))[-1][:, :, :1].mT.cpu().numpy()
-    return forward(net, x)[-1].mT.cpu().numpy()
-
-
-def normal_noise(generators, num_steps, num_envs, act_dim):
-    """Standard normal numbers [steps, members, envs, act_dim], each member's from its own generator."""
-    return np.stack([g.standard_normal((num_steps, num_envs, act_dim), np.float32) for g in generators], axis=1)
-
-
-# ---------------------------------------------------------------- mutate
+# ---------------------------------------------------------------- mutate (Section 3.2.2)
 
 
 def generalized_advantages(rewards, values, next_values, terminations, dones, gamma, gae_lambda):
     """GAE (https://arxiv.org/abs/1506.02438) over time-major arrays [steps, envs].
 
-    A termination ends the value at 0; a truncation bootstraps from next_values, the value of the final observation;
+    A termination ends the value at 0, a truncation bootstraps from next_values, the value of the final observation;
     either cuts the sum of lambda-weighted errors.
     """
-    advantages = np.empty_like(values)
+    advantages, lastgaelam = np.empty_like(values), np.zeros_like(values[0])
     deltas = rewards + gamma * np.where(terminations, 0.0, next_values) - values
-    lastgaelam = np.zeros_like(values[0])
     for t in reversed(range(len(rewards))):
         advantages[t] = lastgaelam = deltas[t] + gamma * gae_lambda * ~dones[t] * lastgaelam
     return advantages
@@ -505,42 +596,162 @@ def generalized_advantages(rewards, values, next_values, terminations, dones, ga
 
 def by_member(x, members):
     """Time-major [steps, members * envs, ...] to [members, steps * envs, ...]."""
-    steps, num_envs = x.shape[:2]
-    x = x.reshape(steps, members, num_envs // members, *x.shape[2:]).swapaxes(0, 1)
+    x = x.reshape(len(x), members, -1, *x.shape[2:]).swapaxes(0, 1)
     return np.ascontiguousarray(x).reshape(members, -1, *x.shape[3:])
 
 
 def make_batches(args, data, policy, critic, stats):
-    """A roll-out as one batch per member: obs [1, obs_dim, N], actions [1, act_dim, N], advantages and log_probs [1, N],
-    mean and log_std of the policy that acted; and the critic's (obs [members, N, obs_dim], values, returns [members, N]).
+    """A roll-out as one batch per member, with the critic's samples.
+
+    A batch: obs [1, obs_dim, N], actions [1, act_dim, N], mean and log_std of the policy that acted, log_probs [1, N].
+    The critic's: obs [members, N, obs_dim], values, returns and advantages [members, N], raw.
     """
     members, device = len(policy.flat), policy.flat.device
-    obs = torch.from_numpy(normalize(by_member(data.obs, members), stats)).to(device)
-    next_obs = torch.from_numpy(normalize(by_member(data.next_obs, members), stats)).to(device)
-    actions = torch.from_numpy(by_member(data.actions, members)).to(device).mT.contiguous()
+    obs, next_obs = (normalize(by_member(x, members), stats) for x in (data.obs, data.next_obs))
+    obs, next_obs, actions = (torch.from_numpy(x).to(device) for x in (obs, next_obs, by_member(data.actions, members)))
     columns = obs.mT.contiguous()
 
     def values_of(x):
-        values = np.concatenate([forward(critic.rows[i], x[i : i + 1])[-1][0].cpu().numpy() for i in range(members)])
-        values = values.astype(np.float64) * stats.return_rms[:, None]
+        values = np.concatenate([forward(row, x[i : i + 1])[-1][0].cpu().numpy() for i, row in enumerate(critic.rows)])
+        values = values * stats.return_rms[:, None]
         return values.reshape(members, args.num_steps, -1).swapaxes(0, 1).reshape(data.rewards.shape)
 
     values, next_values = values_of(columns), values_of(next_obs.mT)
     advantages = generalized_advantages(
         data.rewards, values, next_values, data.terminations, data.dones, args.gamma, args.gae_lambda
     )
-    values, returns, advantages = (by_member(x, members) for x in (values, values + advantages, advantages))
-    if args.norm_adv:
-        advantages = (advantages - advantages.mean(1, keepdims=True)) / (advantages.std(1, keepdims=True) + 1e-8)
-    advantages = torch.from_numpy(advantages.astype(np.float32)).to(device)
-
     batches = []
     for i, row in enumerate(policy.rows):
-        batch = SimpleNamespace(obs=columns[i : i + 1], actions=actions[i : i + 1], advantages=advantages[i : i + 1])
+        batch = SimpleNamespace(obs=columns[i : i + 1], actions=actions[i : i + 1].mT.contiguous())
         batch.mean, batch.log_std = forward(row, batch.obs)[-1], row.log_std.clone()
         batch.log_probs = gaussian_log_prob(batch.actions, batch.mean, batch.log_std)
         batches.append(batch)
-    return batches, obs, values, returns
+    return batches, (obs, *(by_member(x, members) for x in (values, values + advantages, advantages)))
+
+
+def set_advantages(args, batches, advantages, pool):
+    """Gives each batch its advantages [1, N], rows of [members, N]; --norm-adv by the rows of pool that they belong to."""
+    for batch, own, normalizer in zip(batches, advantages, pool):
+        if args.norm_adv:
+            own = (own - normalizer.mean()) / (normalizer.std() + 1e-8)
+        batch.advantages = torch.from_numpy(own.astype(np.float32)[None]).to(batch.obs.device)
+
+
+def policy_gradient_terms(policy, batch, clip):
+    """One batch's part of the surrogate's gradient, for A2C and PPO: mean of ratio * advantage, ratio = pi_i / pi_acting.
+
+    A ratio above clip counts as the clip, detached (as in V-trace, https://arxiv.org/abs/1802.01561). With e = a - mean and
+    v = exp(2 log_std): d log pi / d mean = e / v, d log pi / d log_std = e^2 / v - 1. Adds the latter's part to policy.grad;
+    returns activations, the loss's derivative with respect to the mean [1, act_dim, N], 1 / v, and the loss.
+    """
+    activations = forward(policy, batch.obs)
+    error, inv_var = batch.actions - activations[-1], torch.exp(-2 * policy.log_std)
+    ratio = torch.exp(gaussian_log_prob(batch.actions, activations[-1], policy.log_std) - batch.log_probs).clamp_(max=clip)
+    weight = (ratio * batch.advantages / ratio.shape[1])[:, None]
+    scaled = error * inv_var
+    policy.log_std_grad.sub_((weight * (scaled * error - 1)).sum(-1, keepdim=True))
+    return activations, -weight * scaled, inv_var, -weight.sum().item()
+
+
+def ppo_gradient(policy, batches, kl_coef, importance_clip=math.inf):
+    """Adds to policy.grad the gradient of one member's -L^PPO with data-sharing (Section 3.2.2); returns its loss.
+
+    batches: the member's own, then the borrowed. Their surrogates are summed; on the own, kl_coef * KL[old, new] is
+    subtracted, and ratios are not clipped. With v = exp(2 log_std): d KL / d mean = (mean - old) / v and
+    d KL / d log_std = 1 - (v_old + (mean - old)^2) / v.
+    """
+    loss = 0.0
+    for k, batch in enumerate(batches):
+        clip = importance_clip if k > 0 else math.inf
+        activations, grad, inv_var, batch_loss = policy_gradient_terms(policy, batch, clip)
+        if k == 0:
+            drift, old_var = activations[-1] - batch.mean, torch.exp(2 * batch.log_std)
+            grad.add_(drift * inv_var, alpha=kl_coef / drift.shape[2])
+            kl_grad = 1 - ((old_var + drift.square()) * inv_var).mean(-1, keepdim=True)
+            policy.log_std_grad.add_(kl_grad, alpha=kl_coef)
+        backward(policy, activations, grad)
+        loss += batch_loss
+    return loss
+
+
+def ppo_penalty(args, kl_coef, kl):
+    """The weight of KL's gradient where the KL is kl: beta, and the slope of kl_hinge * max(0, KL - 2 kl_target)^2."""
+    return kl_coef + 2 * args.kl_hinge * max(0.0, kl - 2 * args.kl_target)
+
+
+def adapt_kl_coef(args, kl_coef, kl):
+    """Beta for the next iteration, adapted to the KL of this one (https://arxiv.org/abs/1707.06347, Section 4)."""
+    if kl > 1.5 * args.kl_target:
+        return min(kl_coef * 2, 1e4)
+    return max(kl_coef / 2, 1e-4) if kl < args.kl_target / 1.5 else kl_coef
+
+
+def ppo_update(args, policy, batches, borrowed, kl_coefs):
+    """PPO's full-batch steps for a stack; adapts kl_coefs in place. Returns losses and KLs, one per member."""
+    losses, kls = [0.0] * len(batches), [0.0] * len(batches)
+    for _ in range(args.update_epochs):
+        policy.grad.zero_()
+        for i, (row, own) in enumerate(zip(policy.rows, batches)):
+            penalty = ppo_penalty(args, kl_coefs[i].item(), kls[i])
+            losses[i] = ppo_gradient(row, [own, *borrowed[i]], penalty, getattr(args, "importance_clip", math.inf))
+        adam_step(policy, args.learning_rate)
+        kls = [policy_kl(row, own) for row, own in zip(policy.rows, batches)]
+    for i, kl in enumerate(kls):
+        kl_coefs[i] = adapt_kl_coef(args, kl_coefs[i].item(), kl)
+    return losses, kls
+
+
+def update_critics(args, critic, obs, targets, generators):
+    """Fits a stack of critics to targets [members, N] by the mean squared error."""
+    rows = torch.cat([obs, torch.from_numpy(targets.astype(np.float32)).to(obs.device)[..., None]], dim=2)
+    indices = shuffles(generators, obs.shape[1], args.critic_epochs, obs.device)
+
+    def squared_error_gradient(values, targets):
+        return (values - targets) / values.shape[2]
+
+    def step():
+        adam_step(critic, args.critic_learning_rate)
+
+    fit(critic, rows, squared_error_gradient, indices, args.critic_minibatch_size, step)
+
+
+def batch_moments(obs, returns):
+    """Of one member's batch: count, mean and sum of squared deviations of raw obs [N, obs_dim]; mean square of returns."""
+    obs = obs.astype(np.float64)
+    mean = obs.mean(0)
+    return len(obs), mean, np.square(obs - mean).sum(0), np.square(returns).mean()
+
+
+def update_statistics(args, population, i, moments):
+    """Adds batches, as moments in the given order, to local member i's statistics (Chan et al. 1979 for observations)."""
+    for count, mean, m2, _ in moments if args.norm_obs else ():
+        old = population.obs_count[i].item()
+        delta = torch.from_numpy(mean) - population.obs_mean[i]
+        population.obs_m2[i] += torch.from_numpy(m2) + delta**2 * (old * count / (old + count))
+        population.obs_mean[i] += delta * (count / (old + count))
+        population.obs_count[i] += count
+    if args.norm_returns:  # an average over about the last 20 iterations
+        population.return_weight[i] = 0.95 * population.return_weight[i] + 1
+        population.return_square[i] = 0.95 * population.return_square[i] + np.mean([m[3] for m in moments])
+
+
+def statistics(population):
+    """What networks use of running statistics: mean, inv_std [members, obs_dim], return_rms [members]; at first 0, 1, 1."""
+    fresh = population.obs_count == 0
+    var = population.obs_m2 / population.obs_count.clamp(min=1)[:, None]
+    var[fresh] = 1
+    square = population.return_square / population.return_weight.clamp(min=1)
+    square[population.return_weight == 0] = 1
+    return SimpleNamespace(
+        mean=population.obs_mean.float().numpy(),
+        inv_std=(1 / (var + 1e-8).sqrt()).float().numpy(),
+        return_rms=(square + 1e-8).sqrt().numpy(),
+    )
+
+
+def row_of(stats, i):
+    """Member i's statistics, as a stack of one."""
+    return SimpleNamespace(**{name: x[i : i + 1] for name, x in vars(stats).items()})
 
 
 def kl_row(own, obs, policies, args):
@@ -552,108 +763,22 @@ def kl_row(own, obs, policies, args):
     return np.array(kls)
 
 
-def ppo_gradient(policy, batches, kl_coef, importance_clip=math.inf):
-    """Adds to policy.grad the gradient of -L^PPO with data-sharing (Section 3.2.2) of one member; returns its loss.
-
-    batches: the member's own first, then the borrowed. For each, the mean over samples of ratio * advantage is summed,
-    the ratio being pi_i over the pi_j that acted; on the member's own, kl_coef * KL[old, new] is subtracted.
-    A borrowed ratio above importance_clip counts as the clip (as in V-trace, https://arxiv.org/abs/1802.01561).
-    With e = a - mean and v = exp(2 log_std): d log pi / d mean = e / v and d log pi / d log_std = e^2 / v - 1.
-    """
-    loss, inv_var = 0.0, torch.exp(-2 * policy.log_std)
-    for k, batch in enumerate(batches):
-        activations = forward(policy, batch.obs)
-        mean, samples = activations[-1], batch.obs.shape[2]
-        ratio = torch.exp(gaussian_log_prob(batch.actions, mean, policy.log_std) - batch.log_probs)
-        if k > 0:
-            ratio.clamp_(max=importance_clip)
-        weight = (ratio * batch.advantages / samples)[:, None]
-        error = batch.actions - mean
-        scaled = error * inv_var
-        mean_grad = -weight * scaled
-        policy.log_std_grad.sub_((weight * (scaled * error - 1)).sum(-1, keepdim=True))
-        if k == 0:
-            drift = mean - batch.mean
-            mean_grad.add_(drift * inv_var, alpha=kl_coef / samples)
-            old_var = torch.exp(2 * batch.log_std)
-            kl_grad = 1 - ((old_var + drift.square()) * inv_var).mean(-1, keepdim=True)
-            policy.log_std_grad.add_(kl_grad, alpha=kl_coef)
-        backward(policy, activations, mean_grad)
-        loss -= weight.sum().item()
-    return loss
+def share(batches):
+    """All members' batches, as far as a borrower needs them."""
+    names = ("obs", "actions", "advantages", "log_probs")
+    shared = gather([{name: getattr(batch, name).cpu().numpy() for name in names} for batch in batches])
+    device = batches[0].obs.device
+    return [SimpleNamespace(**{name: torch.from_numpy(x).to(device) for name, x in batch.items()}) for batch in shared]
 
 
-def policy_kl(policy, batch):
-    """Mean KL[old, new] of one member over the states of a batch."""
-    mean = forward(policy, batch.obs)[-1]
-    return gaussian_kl(batch.mean, batch.log_std, mean, policy.log_std).mean().item()
+# ---------------------------------------------------------------- select (Section 3.2.3)
 
 
-def update_policies(args, policy, optimizer, batches, borrowed, kl_coefs):
-    """PPO's full-batch steps for a stack, then beta's adaptation in kl_coefs. Returns losses and KLs, one per member."""
-    losses, kls = [0.0] * len(batches), [0.0] * len(batches)
-    for _ in range(args.update_epochs):
-        policy.grad.zero_()
-        for i, (row, own) in enumerate(zip(policy.rows, batches)):
-            hinge = 2 * args.kl_hinge * max(0.0, kls[i] - 2 * args.kl_target)  # d/dKL of kl_hinge max(0, KL - 2 target)^2
-            losses[i] = ppo_gradient(row, [own, *borrowed[i]], kl_coefs[i] + hinge, args.importance_clip)
-        optimizer.step()
-        kls = [policy_kl(row, own) for row, own in zip(policy.rows, batches)]
-    for i, kl in enumerate(kls):
-        if kl > 1.5 * args.kl_target:
-            kl_coefs[i] = min(kl_coefs[i] * 2, 1e4)
-        elif kl < args.kl_target / 1.5:
-            kl_coefs[i] = max(kl_coefs[i] / 2, 1e-4)
-    return losses, kls
-
-
-def update_critics(args, critic, optimizer, obs, targets, generators):
-    """Fits a stack of critics to targets [members, N] by the mean squared error."""
-    rows = torch.cat([obs, torch.from_numpy(targets.astype(np.float32)).to(obs.device)[..., None]], dim=2)
-    indices = shuffles(generators, obs.shape[1], args.critic_epochs, obs.device)
-    fit(critic, optimizer, rows, lambda v, t: (v - t) / v.shape[2], indices, args.critic_minibatch_size)
-
-
-def batch_moments(obs):
-    """Count, mean and sum of squared deviations [obs_dim] of raw observations [N, obs_dim], in float64."""
-    obs = obs.astype(np.float64)
-    mean = obs.mean(0)
-    return len(obs), mean, np.square(obs - mean).sum(0)
-
-
-def update_statistics(args, population, i, moments, mean_squares):
-    """Adds batches to the statistics of local member i, in the given order: observations (Chan et al.), squared returns."""
-    if args.norm_obs:
-        for count, mean, m2 in moments:
-            total, delta = population.obs_count[i] + count, mean - population.obs_mean[i]
-            population.obs_m2[i] += m2 + delta**2 * population.obs_count[i] * count / total
-            population.obs_mean[i] += delta * count / total
-            population.obs_count[i] = total
-    if args.norm_returns:  # an average over about the last 20 iterations
-        population.return_weight[i] = 0.95 * population.return_weight[i] + 1
-        population.return_square[i] = 0.95 * population.return_square[i] + np.mean(mean_squares)
-
-
-def statistics(population):
-    """What policies and critics use of the running statistics: mean, inv_std [members, obs_dim], return_rms [members]."""
-    count = np.maximum(population.obs_count, 1)[:, None]
-    std = np.sqrt(np.where(population.obs_count[:, None] > 0, population.obs_m2 / count, 1.0) + 1e-8)
-    square = np.where(population.return_weight > 0, population.return_square, 1.0)
-    return SimpleNamespace(
-        mean=population.obs_mean.astype(np.float32),
-        inv_std=(1 / std).astype(np.float32),
-        return_rms=np.sqrt(square / np.maximum(population.return_weight, 1) + 1e-8),
-    )
-
-
-# ---------------------------------------------------------------- select
-
-
-def select(args, round, fitness, kl):
-    """The m couples that breed (Section 3.2.3), as index pairs x < y; ties are broken by index.
+def select(args, generation, fitness, kl):
+    """The m couples that breed, as index pairs x < y; ties are broken by index.
 
     fitness [m]: mean returns, NaN for a member that must not breed; kl [m, m]: KL[i, j]. Fewer couples than m are
-    used again in turn; one healthy member is paired with itself; none raises RuntimeError.
+    used again in turn; a single healthy member is paired with itself; none raises RuntimeError.
     """
     m = len(fitness)
     healthy = [i for i in range(m) if np.isfinite(fitness[i])]
@@ -662,41 +787,39 @@ def select(args, round, fitness, kl):
     if len(healthy) == 1:
         return [(healthy[0], healthy[0])] * m
     couples = list(combinations(healthy, 2))
-    generator = rng(args.seed, "select", round)
     if args.selection == "random":
-        order = generator.permutation(len(couples))
+        order = rng(args.seed, "select", generation).permutation(len(couples))
     else:
-        scores = couple_fitness(args, round, couples, fitness, kl)
-        order = np.argsort(-scores, kind="stable")
+        order = np.argsort(-couple_fitness(args, generation, couples, fitness, kl), kind="stable")
     return [couples[order[k % len(couples)]] for k in range(m)]
 
 
-def couple_fitness(args, round, couples, fitness, kl):
+def couple_fitness(args, generation, couples, fitness, kl):
     """Performance, diversity, or their mixture as z-scores over couples, the weight of diversity annealed over rounds."""
     performance = np.array([fitness[x] + fitness[y] for x, y in couples])
     diversity = np.array([kl[x, y] + kl[y, x] for x, y in couples])
     if args.fitness != "mixture":
         return performance if args.fitness == "performance" else diversity
-    weight = args.diversity_weight * (1 - round / max(args.rounds - 1, 1))
+    weight = args.diversity_weight * (1 - generation / max(len(args.plan) - 1, 1))
     z_performance, z_diversity = ((x - x.mean()) / (x.std() + 1e-8) for x in (performance, diversity))
     return (1 - weight) * z_performance + weight * z_diversity
 
 
-# ---------------------------------------------------------------- crossover
+# ---------------------------------------------------------------- crossover (Section 3.2.1)
 
 
 def selector_data(args, pools, couple, stats):
-    """pi_S's samples (Section 3.2.1): rows [N, obs_dim + 2] of observation, weight if from x, weight if from y.
+    """pi_S's samples: rows [N, obs_dim + 2] of normalized observation, weight if from x, weight if from y.
 
     pools[i]: member i's recent trajectories as (obs [L, obs_dim], return). The best of both parents' together are kept.
     """
     trajectories = [(obs, ret, parent) for parent, i in enumerate(couple) for obs, ret in pools[i]]
     trajectories.sort(key=lambda trajectory: -trajectory[1])
     kept = trajectories[: max(1, int(args.crossover_top * len(trajectories)))]
-    worst, best = kept[-1][1], kept[0][1]
+    best, worst = kept[0][1], kept[-1][1]
     rows = []
     for obs, ret, parent in kept:
-        row = np.zeros((len(obs), obs.shape[1] + 2), np.float32)
+        row = np.zeros((len(obs), args.obs_dim + 2), np.float32)
         row[:, :-2] = normalize(obs[None], row_of(stats, 0))[0]
         row[:, -2 + parent] = 0.1 + (ret - worst) / (best - worst) if best > worst else 1.0
         rows.append(row)
@@ -705,147 +828,143 @@ def selector_data(args, pools, couple, stats):
     return rows
 
 
-def pad_rows(rows):
-    """A list of [N_i, width] as one tensor [members, max N_i, width]."""
-    padded = np.zeros((len(rows), max(map(len, rows)), rows[0].shape[1]), np.float32)
-    for out, row in zip(padded, rows):
-        out[: len(row)] = row
-    return torch.from_numpy(padded)
-
-
-def train_selector(args, round, slots, rows, steps, device):
+def train_selector(args, generation, slots, rows, steps, device):
     """pi_S of each couple by return-weighted maximum likelihood (Equation 1), all as one stack; outputs are logits.
 
-    All take `steps` gradient steps, pi_s_epochs passes over the population's largest data set; a smaller one is repeated.
+    rows: each couple's samples. All take `steps` gradient steps; a data set that is through before starts again.
     """
     sizes = (args.obs_dim, 32, 32, 2)
-    pi_s = make_net(init_rows([rng(args.seed, "pi_s", round, slot) for slot in slots], sizes, 0.01).to(device), sizes)
+    pi_s = make_net(init_rows([rng(args.seed, "pi_s", generation, slot) for slot in slots], sizes, 0.01).to(device), sizes)
+    adam(pi_s)
+    padded = torch.zeros(len(rows), max(map(len, rows)), args.obs_dim + 2, device=device)
+    samples, indices = steps * args.crossover_minibatch_size, []
+    for k, slot in enumerate(slots):
+        padded[k, : len(rows[k])] = torch.from_numpy(rows[k])
+        generator, epochs = rng(args.seed, "pi_s_shuffle", generation, slot), math.ceil(samples / len(rows[k]))
+        indices.append(shuffles([generator], len(rows[k]), epochs, device)[:, :samples])
 
     def cross_entropy_gradient(logits, weights):
         return (torch.softmax(logits, 1) * weights.sum(1, keepdim=True) - weights) / logits.shape[2]
 
-    samples = steps * args.crossover_minibatch_size
-    indices = []
-    for slot, row in zip(slots, rows):
-        generator = rng(args.seed, "pi_s_shuffle", round, slot)
-        epochs = math.ceil(samples / len(row))
-        indices.append(shuffles([generator], len(row), epochs, device)[:, :samples])
-    optimizer = adam(pi_s, args.crossover_learning_rate)
-    padded = pad_rows(rows).to(device)
-    fit(pi_s, optimizer, padded, cross_entropy_gradient, torch.cat(indices), args.crossover_minibatch_size)
+    def step():
+        adam_step(pi_s, args.crossover_learning_rate)
+
+    fit(pi_s, padded, cross_entropy_gradient, torch.cat(indices), args.crossover_minibatch_size, step)
     return pi_s
 
 
 def expert_targets(pi_s, parents, obs, uniform):
-    """pi_H's Gaussian per state: the parent is drawn once from pi_S, and kept. Returns (mean, log_std) in one array.
+    """pi_H's Gaussian per state, (mean, log_std) in one array: the parent is drawn once from pi_S, and kept.
 
-    obs [children, samples, obs_dim] normalized; uniform [children, samples] in [0, 1); parents: the stacks of x and y.
+    obs [children, samples, obs_dim] normalized; uniform [children, samples] in (0, 1); parents: the stacks of x and of y.
     """
-    logits = policy_mean(pi_s, obs)
-    # uniform < pi_S(x|s) without the exponential of a large number
-    choose_x = (np.log(uniform) - np.log1p(-uniform) < logits[..., 0] - logits[..., 1])[..., None]
+    logits = net_output(pi_s, obs)
+    choose_x = np.log(uniform / (1 - uniform)) < logits[..., 0] - logits[..., 1]  # uniform < pi_S(x|s)
     targets = []
     for parent in parents:
-        mean = policy_mean(parent, obs)
+        mean = net_output(parent, obs)
         targets.append(np.concatenate([mean, np.broadcast_to(parent.log_std.mT.cpu().numpy(), mean.shape)], axis=2))
-    return np.where(choose_x, *targets)
+    return np.where(choose_x[..., None], *targets)
 
 
-def distill(args, round, slots, child, pi_s, parents, stats):
-    """DAgger (Section 3.2.1, Appendix): fits a stack of children to pi_H by KL[pi_c, pi_H]; returns mean rewards per step
-    of the expert and of the last student, and the final loss, one per child.
-    """
-    n, act_dim, device = len(slots), args.act_dim, child.flat.device
-    size, optimizer = args.crossover_minibatch_size, adam(child, args.crossover_learning_rate)
+def dagger_rollout(args, generation, slots, iteration, num_envs, num_steps, pi_s, parents, student, stats):
+    """Transitions labelled by pi_H: rows [children, N, obs_dim + 2 * act_dim]; pi_H acts, or the student if there is one."""
+    n, generators = len(slots), [rng(args.seed, "dagger", generation, slot, iteration) for slot in slots]
+    noise = normal_noise(generators, num_steps, num_envs, args.act_dim)
+    uniform = np.stack([1 - g.uniform(size=(num_steps, num_envs)) * (1 - 1e-9) for g in generators], axis=1)
+    labels = []
+
+    def expert(obs, t):
+        labels.append(expert_targets(pi_s, parents, normalize(obs.reshape(n, num_envs, -1), stats), uniform[t]))
+        mean, log_std = np.split(labels[-1], 2, axis=2)
+        return (mean + np.exp(log_std) * noise[t]).reshape(n * num_envs, -1)
+
+    envs = make_envs(args, n * num_envs)
+    seeds = [env_seeds(num_envs, args.seed, "dagger_envs", generation, slot, iteration) for slot in slots]
+    obs, _ = envs.reset(seed=sum(seeds, []))
+    act = sample_actions(student, stats, noise) if student else expert
+    data = rollout(envs, obs.reshape(n * num_envs, -1), act, num_steps)
+    envs.close()
+    obs = normalize(by_member(data.obs, n), stats)
+    if student:
+        labels = expert_targets(pi_s, parents, obs, uniform.swapaxes(0, 1).reshape(n, -1))
+    else:
+        labels = by_member(np.stack(labels).reshape(num_steps, n * num_envs, -1), n)
+    return torch.from_numpy(np.concatenate([obs, labels], axis=2).astype(np.float32)), by_member(data.rewards, n).mean(1)
+
+
+def distill(args, generation, slots, child, pi_s, parents, stats):
+    """DAgger (Appendix): fits a stack of children to pi_H by KL[pi_c, pi_H] (Equation 2). Returns facts per child."""
+    adam(child)
+    d, a, device = args.obs_dim, args.act_dim, child.flat.device
 
     def kl_gradient(mean, targets):
-        expert_mean, inv_var = targets[:, :act_dim], torch.exp(-2 * targets[:, act_dim:])
-        var_ratio = torch.exp(2 * child.log_std) * inv_var
-        child.log_std_grad.add_((var_ratio - 1).mean(-1, keepdim=True))
-        return (mean - expert_mean) * inv_var / mean.shape[2]
+        inv_var = torch.exp(-2 * targets[:, a:])
+        child.log_std_grad.add_((torch.exp(2 * child.log_std) * inv_var - 1).mean(-1, keepdim=True))
+        return (mean - targets[:, :a]) * inv_var / mean.shape[2]
 
-    def roll(num_envs, num_steps, iteration, expert):
-        envs = make_envs(args, n * num_envs)
-        seeds = [s for slot in slots for s in env_seeds(num_envs, args.seed, "dagger", round, slot, iteration)]
-        generators = [rng(args.seed, "dagger_noise", round, slot, iteration) for slot in slots]
-        noise = normal_noise(generators, num_steps, num_envs, act_dim)
-        uniform = np.stack([g.uniform(size=(num_steps, num_envs)) for g in generators], axis=1)
-        targets = np.empty((num_steps, n * num_envs, 2 * act_dim), np.float32)
+    def step():
+        adam_step(child, args.crossover_learning_rate)
 
-        def act_as_expert(obs, t):
-            target = expert_targets(pi_s, parents, normalize(obs.reshape(n, num_envs, -1), stats), uniform[t])
-            targets[t] = target.reshape(n * num_envs, -1)
-            return (target[..., :act_dim] + np.exp(target[..., act_dim:]) * noise[t]).reshape(n * num_envs, -1)
+    def transitions(iteration, num_envs, num_steps, student):
+        return dagger_rollout(args, generation, slots, iteration, num_envs, num_steps, pi_s, parents, student, stats)
 
-        obs, _ = envs.reset(seed=seeds)
-        act = act_as_expert if expert else sample_actions(child, stats, noise)
-        data = rollout(envs, obs.reshape(n * num_envs, -1), act, num_steps)
-        envs.close()
-        obs = normalize(by_member(data.obs, n), stats)
-        if expert:
-            labels = by_member(targets, n)
-        else:
-            labels = expert_targets(pi_s, parents, obs, uniform.swapaxes(0, 1).reshape(n, -1))
-        rows = torch.from_numpy(np.concatenate([obs, labels], axis=2).astype(np.float32)).to(device)
-        return rows, by_member(data.rewards, n).mean(1)
-
-    rows, expert_reward = roll(10, args.expert_steps // 10, 0, expert=True)
-    student_reward = expert_reward
+    rows, expert_rewards = transitions(0, 10, args.expert_steps // 10, None)
+    rows, student_rewards = rows.to(device), expert_rewards
     for iteration in range(args.dagger_iterations + 1):
         if iteration > 0:
-            student_rows, student_reward = roll(1, args.student_steps, iteration, expert=False)
-            rows = torch.cat([rows, student_rows], dim=1)
-        generators = [rng(args.seed, "dagger_shuffle", round, slot, iteration) for slot in slots]
+            new, student_rewards = transitions(iteration, 1, args.student_steps, child)
+            rows = torch.cat([rows, new.to(device)], dim=1)
+        generators = [rng(args.seed, "dagger_shuffle", generation, slot, iteration) for slot in slots]
         indices = shuffles(generators, rows.shape[1], args.dagger_epochs, device)
-        fit(child, optimizer, rows, kl_gradient, indices, size)
+        fit(child, rows, kl_gradient, indices, args.crossover_minibatch_size, step)
 
-    obs, targets = rows[..., : args.obs_dim].mT, rows[..., args.obs_dim :].mT
-    mean = forward(child, obs)[-1]
-    loss = gaussian_kl(mean, child.log_std, targets[:, :act_dim], targets[:, act_dim:]).mean(1)
-    parent_kls = [gaussian_kl(mean, child.log_std, forward(p, obs)[-1], p.log_std).mean(1) for p in parents]
-    return expert_reward, student_reward, loss, parent_kls
+    obs, mean, log_std = rows[..., :d].mT, rows[..., d : d + a].mT, rows[..., d + a :].mT
+    facts = []
+    for k, row in enumerate(child.rows):
+        here = slice(k, k + 1)
+        targets = [(mean[here], log_std[here])] + [(forward(p.rows[k], obs[here])[-1], p.rows[k].log_std) for p in parents]
+        own = forward(row, obs[here])[-1]
+        kls = [gaussian_kl(own, row.log_std, *target).mean().item() for target in targets]
+        rewards = {"expert_reward": float(expert_rewards[k]), "student_reward": float(student_rewards[k])}
+        facts.append({"distillation_kl": kls[0], "kl_to_parents": kls[1:], **rewards})
+    return facts
 
 
-def crossover(args, round, slots, couples, parents, pools, stats):
-    """The children of couples[slot] for the local slots (Section 3.2.1), as policies [children, P] and facts per child.
+def crossover(args, generation, slots, couples, parents, pools, stats):
+    """The children of couples[slot] for the local slots: policies [children, P], facts per child, pi_S [children, Q] or None.
 
     parents: policies [m, P] and fitness [m] of the whole population; a child starts as a copy of the stronger parent.
     """
     mine = [couples[slot] for slot in slots]
-    stronger = [x if parents.fitness[x] >= parents.fitness[y] else y for x, y in mine]
-    children = parents.policies[stronger].clone()
+    children = parents.policies[[stronger(couple, parents.fitness) for couple in mine]].clone()
     facts = [{} for _ in slots]
     if args.crossover == "parameter":
         for k, (slot, (x, y)) in enumerate(zip(slots, mine)):
-            from_x = torch.from_numpy(rng(args.seed, "parameter", round, slot).random(children.shape[1]) < 0.5)
+            from_x = torch.from_numpy(rng(args.seed, "parameter", generation, slot).random(children.shape[1]) < 0.5)
             children[k] = torch.where(from_x.to(children.device), parents.policies[x], parents.policies[y])
     if args.crossover != "state-space" or mine[0][0] == mine[0][1]:  # a lone healthy member is only copied
         return children, facts, None
 
-    device = children.device
-    rows = {couple: selector_data(args, pools, couple, stats) for couple in set(couples)}
+    rows, clock = {couple: selector_data(args, pools, couple, stats) for couple in set(couples)}, [time.perf_counter()]
     steps = args.pi_s_epochs * math.ceil(max(map(len, rows.values())) / args.crossover_minibatch_size)
-    start = time.perf_counter()
-    pi_s = train_selector(args, round, slots, [rows[couple] for couple in mine], steps, device)
-    middle = time.perf_counter()
-    child = make_policy(children, args)
+    pi_s = train_selector(args, generation, slots, [rows[couple] for couple in mine], steps, children.device)
+    clock.append(time.perf_counter())
     stacks = [make_policy(parents.policies[[couple[side] for couple in mine]], args) for side in (0, 1)]
-    expert_reward, student_reward, loss, parent_kls = distill(args, round, slots, child, pi_s, stacks, stats)
-    end = time.perf_counter()
-    for k, couple in enumerate(mine):
-        row = torch.from_numpy(rows[couple]).to(device)
-        net = make_net(pi_s.flat[k : k + 1], pi_s.sizes)
+    facts = distill(args, generation, slots, make_policy(children, args), pi_s, stacks, stats)
+    clock.append(time.perf_counter())
+    for couple, net, fact in zip(mine, pi_s.rows, facts):
+        row = torch.from_numpy(rows[couple]).to(children.device)
         says_y = forward(net, row[None, :, :-2].mT)[-1][0].argmax(0)
-        facts[k] = {
-            "pi_s_accuracy": (says_y == row[:, -2:].argmax(1)).float().mean().item(),
-            "share_x": (row[:, -2] > 0).float().mean().item(),
-            "expert_reward": float(expert_reward[k]),
-            "student_reward": float(student_reward[k]),
-            "distillation_kl": loss[k].item(),
-            "kl_to_parents": [parent_kls[0][k].item(), parent_kls[1][k].item()],
-            "seconds": [middle - start, end - middle],
-        }
+        fact["pi_s_accuracy"] = (says_y == row[:, -2:].argmax(1)).float().mean().item()
+        fact["share_x"] = (row[:, -2] > 0).float().mean().item()
+        fact["seconds"] = dict(zip(("pi_s", "dagger"), np.diff(clock).tolist()))
     return children, facts, pi_s.flat
+
+
+def stronger(couple, fitness):
+    """The parent with the higher fitness; the first if they are equal."""
+    return max(couple, key=lambda i: fitness[i])
 
 
 def crossover_steps(args):
@@ -861,14 +980,11 @@ def crossover_steps(args):
 def evaluate(args, policy, stats, purpose, episodes, mean_action=False):
     """Raw returns [members, episodes] of complete episodes; all members meet the same starts and the same noise."""
     members, width = len(policy.flat), min(episodes, 20)
-    envs = make_envs(args, members * width)
-    returns = []
+    envs, returns = make_envs(args, members * width), []
     for chunk in range(math.ceil(episodes / width)):
         obs, _ = envs.reset(seed=env_seeds(width, args.seed, purpose, chunk) * members)
-        noise = None
-        if not mean_action:
-            noise = normal_noise([rng(args.seed, purpose, chunk, 1)], args.max_episode_steps, width, args.act_dim)
-        act = sample_actions(policy, stats, noise)
+        noise = normal_noise([rng(args.seed, purpose, chunk, 1)], args.max_episode_steps, width, args.act_dim)
+        act = sample_actions(policy, stats, None if mean_action else noise)
         data = rollout(envs, obs.reshape(members * width, -1), act, args.max_episode_steps)
         in_first_episode = np.cumsum(data.dones, axis=0) - data.dones == 0
         returns.append((data.rewards * in_first_episode).sum(0).reshape(members, width))
@@ -884,37 +1000,29 @@ def evaluation_cost(args, episodes):
 
 def final_evaluation(args, policy, stats, ids):
     """Every member plays selection episodes, and report episodes on other seeds; the best is chosen on the first only,
-    because the maximum that won a selection is biased upward.
+    because the maximum that won a selection is biased upward. Returns the content of evaluation.json, less the steps.
     """
-    selection = evaluate(args, policy, stats, "selection", args.selection_episodes)
-    report = evaluate(args, policy, stats, "report", args.report_episodes)
-    report_mean_action = evaluate(args, policy, stats, "report", args.report_episodes, mean_action=True)
-    members = [
-        {
-            "id": ids[i],
-            "selection_return": float(selection[i].mean()),
-            "report_return": float(report[i].mean()),
-            "report_std": float(report[i].std(ddof=1)) if args.report_episodes > 1 else 0.0,
-            "mean_action_return": float(report_mean_action[i].mean()),
-        }
-        for i in range(len(ids))
-    ]
+    members = []
+    if ids:
+        selection = evaluate(args, policy, stats, "selection", args.selection_episodes)
+        report, mean_action = (evaluate(args, policy, stats, "report", args.report_episodes, x) for x in (False, True))
+        for i, member in enumerate(ids):
+            returns = {"selection": selection[i], "report": report[i], "mean_action": mean_action[i]}
+            means = {f"{name}_return": float(x.mean()) for name, x in returns.items()}
+            members.append({"id": member, **means, "report_std": float(report[i].std())})
     members = gather(members)
-    best = max(range(len(members)), key=lambda i: members[i]["selection_return"])
-    returns = [member["report_return"] for member in members]
-    steps = len(members) * (evaluation_cost(args, args.selection_episodes) + 2 * evaluation_cost(args, args.report_episodes))
-    result = {
-        "best": returns[best],
-        "best_std": members[best]["report_std"],
-        "best_mean_action": members[best]["mean_action_return"],
-        "mean": float(np.mean(returns)),
-        "best_slot": best,
-        "best_id": members[best]["id"],
+    best = max(members, key=lambda member: member["selection_return"])
+    return {
+        "best": best["report_return"],
+        "best_std": best["report_std"],
+        "best_mean_action": best["mean_action_return"],
+        "best_id": best["id"],
+        "best_slot": members.index(best),
+        "mean": float(np.mean([member["report_return"] for member in members])),
         "selection_episodes": args.selection_episodes,
         "report_episodes": args.report_episodes,
         "members": members,
     }
-    return result, steps
 
 
 # ---------------------------------------------------------------- workers
@@ -923,6 +1031,12 @@ def final_evaluation(args, policy, stats, ids):
 def world():
     """(rank, number of workers) of this process."""
     return (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
+
+
+def local_slots(population):
+    """The members that this worker owns; any split will do."""
+    rank, workers = world()
+    return np.array_split(np.arange(population), workers)[rank].tolist()
 
 
 def gather(values):
@@ -935,28 +1049,8 @@ def gather(values):
 
 
 def gather_rows(stack):
-    """The rows of all workers' stacks as one stack on the same device."""
+    """The rows of all workers' stacks, in member order, as one stack on the same device."""
     return torch.from_numpy(np.stack(gather(list(stack.cpu().numpy())))).to(stack.device)
-
-
-def share(batches):
-    """All members' batches, as far as a borrower needs them."""
-    names = ("obs", "actions", "advantages", "log_probs")
-    shared = gather([{name: getattr(batch, name).cpu().numpy() for name in names} for batch in batches])
-    device = batches[0].obs.device
-    return [SimpleNamespace(**{name: torch.from_numpy(x).to(device) for name, x in batch.items()}) for batch in shared]
-
-
-def local_slots(population):
-    """The slots of the population that this worker owns; any split will do."""
-    rank, workers = world()
-    return [int(slot) for slot in np.array_split(np.arange(population), workers)[rank]]
-
-
-def die_with_parent():
-    """Asks Linux to kill this worker when its launcher dies, however that happens; elsewhere this is left out."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
 def launch(args, argv):
@@ -975,36 +1069,45 @@ def launch(args, argv):
         max_restarts=args.max_restarts,
         monitor_interval=0.5,
     )
+    folder = Path(args.run_dir) / args.run_name
     try:
         elastic_launch(config, sys.executable)(__file__, *argv, "--run-name", args.run_name)
     except SignalException as stop:
+        print(f"stopped; go on with --resume {folder}", file=sys.stderr)
         raise SystemExit(128 + stop.sigval.value) from None
     except ChildFailedError as failure:
-        codes = sorted({f.exitcode for f in failure.failures.values()})
-        if codes == [2]:
-            raise SystemExit(2) from None
-        print(f"{Path(__file__).name}: error: a worker failed (exit code {codes[0]}); its own error is above", file=sys.stderr)
-        raise SystemExit(1) from None
+        code = next(iter(failure.failures.values())).exitcode
+        print(f"a worker ended with exit code {code}; its error is above, its run in {folder}", file=sys.stderr)
+        raise SystemExit(2 if code == 2 else 1) from None
+    return json.loads((folder / "evaluation.json").read_text())
+
+
+def start_worker(args):
+    """Joins the group; a worker that was started again goes on from the run's checkpoint."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG: die with the launcher, however it ends
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the launcher answers it
+    dist.init_process_group("gloo")
+    if (Path(args.run_dir) / args.run_name / "checkpoint.pt").exists():
+        args.resume = str(Path(args.run_dir) / args.run_name)
 
 
 # ---------------------------------------------------------------- a run's folder
 
-PER_MEMBER = "policies critics kl_coefs obs_count obs_mean obs_m2 return_square return_weight ids".split()
-
 
 def new_population(args, slots):
-    """Random policies and critics for the local slots, all statistics empty; every field has one row per member."""
+    """Random policies and critics for the local slots, and empty statistics; every field has one row per member."""
     n = len(slots)
     return SimpleNamespace(
         policies=init_rows([rng(args.seed, "policy", slot) for slot in slots], policy_sizes(args), 0.01, log_std=True),
         critics=init_rows([rng(args.seed, "critic", slot) for slot in slots], critic_sizes(args), 1.0),
-        kl_coefs=np.full(n, args.kl_coef),
-        obs_count=np.zeros(n),
-        obs_mean=np.zeros((n, args.obs_dim)),
-        obs_m2=np.zeros((n, args.obs_dim)),
-        return_square=np.zeros(n),
-        return_weight=np.zeros(n),
-        ids=np.array(slots),
+        kl_coefs=torch.full((n,), getattr(args, "kl_coef", 0.0), dtype=torch.float64),
+        obs_count=torch.zeros(n, dtype=torch.float64),
+        obs_mean=torch.zeros(n, args.obs_dim, dtype=torch.float64),
+        obs_m2=torch.zeros(n, args.obs_dim, dtype=torch.float64),
+        return_square=torch.zeros(n, dtype=torch.float64),
+        return_weight=torch.zeros(n, dtype=torch.float64),
+        ids=torch.tensor(slots),
     )
 
 
@@ -1018,36 +1121,43 @@ def save_atomically(content, path):
     os.replace(beside, path)
 
 
-def save_checkpoint(args, folder, population, progress):
-    """Everything that the rest of the run depends on, as tensors and plain values; all workers call, rank 0 writes."""
-    stacks = {name: gather_rows(torch.as_tensor(getattr(population, name))).cpu() for name in PER_MEMBER}
+def save_checkpoint(args, run, population):
+    """All that the rest of the run depends on, as tensors and plain values; every worker calls, the first one writes."""
+    stacks = {name: gather_rows(stack).cpu() for name, stack in vars(population).items()}
     if world()[0] == 0:
-        save_atomically({"format": 1, "args": args.flags, "population": stacks, "progress": progress}, folder / "checkpoint.pt")
+        content = {"format": 1, "flags": args.flags, "population": stacks, "progress": run.progress}
+        save_atomically(content, run.folder / "checkpoint.pt")
 
 
 def load_checkpoint(folder):
-    """The checkpoint of a run's folder; refuses what is not one."""
+    """The checkpoint in a run's folder; refuses what is not one."""
     path = Path(folder) / "checkpoint.pt"
     if not path.is_file():
         refuse(f"--resume {folder}: there is no {path.name} in this folder")
     try:
         checkpoint = torch.load(path, weights_only=True)
-        if checkpoint["format"] != 1 or checkpoint["args"]["exp_name"] is None:
-            raise ValueError("unknown format")
-        return checkpoint
+        expected = {f.name for group in fields(Args) for f in fields(group.type)}
+        if checkpoint["format"] != 1 or set(checkpoint["flags"]) != expected:
+            raise ValueError("another script's or another version's")
     except Exception as error:
-        refuse(f"--resume {folder}: {path.name} cannot be read as a checkpoint ({type(error).__name__})")
+        reason = " ".join(str(error).split())[:100]
+        refuse(f"--resume {folder}: {path.name} is no checkpoint of this script ({type(error).__name__}: {reason})")
+    return checkpoint
 
 
-def own_rows(stacks, slots):
-    """The local members' part of a checkpoint's population."""
-    rows = {name: stack[slots].clone() for name, stack in stacks.items()}
-    return SimpleNamespace(**{name: x if name in ("policies", "critics") else x.numpy() for name, x in rows.items()})
+def save_policy(args, folder, result, policies, stats):
+    """policy.pt: the best member with its normalizer, and what is needed to play it."""
+    rows = gather(list(zip(policies.cpu(), stats.mean, stats.inv_std)))
+    if world()[0] == 0:
+        policy, mean, inv_std = rows[result["best_slot"]]
+        content = {"format": 1, "flags": args.flags, "max_episode_steps": args.max_episode_steps, "policy": policy.clone()}
+        content |= {"sizes": list(policy_sizes(args)), "mean": torch.from_numpy(mean), "inv_std": torch.from_numpy(inv_std)}
+        save_atomically({**content, "id": result["best_id"], "report_return": result["best"]}, folder / "policy.pt")
 
 
-def lock_folder(folder):
-    """Holds the folder for this process, so that a run which is still alive is not resumed a second time."""
-    handle = open(folder / ".lock", "w")
+def lock(folder):
+    """Holds a run's folder for this process; refuses one that a live run holds."""
+    handle = open(folder / ".lock", "a")
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
@@ -1055,481 +1165,391 @@ def lock_folder(folder):
     return handle
 
 
-def make_logger(args, folder, progress):
-    """log(scalars, step) for TensorBoard and, with --track, W&B; both get one monotone step, the total of env steps."""
-    from torch.utils.tensorboard import SummaryWriter
-
-    writer = SummaryWriter(folder, purge_step=progress["global_step"] + 1 if progress["global_step"] else None)
-    writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in args.flags.items()))
-    if args.track:
-        import wandb
-
-        wandb.init(
-            project=args.wandb_project_name,
-            entity=args.wandb_entity,
-            name=folder.name,
-            id=folder.name,
-            resume="allow",
-            config=args.flags,
-            save_code=True,
+def open_run(args, population):
+    """The run's folder, progress, log(scalars) and show(text), and its population: the given one, or the checkpoint's."""
+    run = SimpleNamespace(folder=Path(args.run_dir) / args.run_name, log=lambda *_: None, show=lambda *_: None)
+    run.progress = {"segment": 0, "global_step": 0, "evaluation_steps": 0, "seconds": 0.0, "lineage_bytes": 0}
+    if args.resume:
+        checkpoint = load_checkpoint(args.resume)
+        run.progress = checkpoint["progress"]
+        for name, stack in checkpoint["population"].items():
+            setattr(population, name, stack[local_slots(len(stack))])
+    device = torch.device("cuda", world()[0] % torch.cuda.device_count()) if args.cuda else torch.device("cpu")
+    population.policies, population.critics = population.policies.to(device), population.critics.to(device)
+    run.start = time.perf_counter() - run.progress["seconds"]
+    if world()[0] == 0:
+        run.lock = lock(run.folder)
+        names = ("torch", "gymnasium", "mujoco", "numpy", "tyro", "tensorboard", "wandb")
+        versions = {"python": sys.version.split()[0], **{name: version(name) for name in names}}
+        (run.folder / "args.json").write_text(json.dumps({**args.flags, "versions": versions}, indent=1) + "\n")
+        run.log, run.show = make_log(args, run), make_show(args, run)
+        if gpo_envs is None:
+            print("gpo_envs is not here: environments are stepped by Gymnasium's SyncVectorEnv", flush=True)
+        steps = args.budget_steps
+        print(
+            f"{run.folder}: {args.population} members, {world()[1]} worker(s), iterations {args.plan}, horizon"
+            f" {args.max_episode_steps}; {steps} of {args.total_timesteps} steps, {steps // args.population} per member",
+            flush=True,
         )
-
-    def log(scalars, step):
-        for name, value in scalars.items():
-            writer.add_scalar(name, value, step)
-        writer.flush()
-        if args.track:
-            wandb.log({**scalars, "global_step": step}, step=step)
-
-    return log
+    if not args.resume:
+        save_checkpoint(args, run, population)
+    return run
 
 
-def make_progress(args, step):
-    """show(step, text): one bar on a terminal, plain lines (at most one in ten seconds) elsewhere."""
-    if sys.stderr.isatty():
-        from tqdm import tqdm
-
-        bar = tqdm(total=args.total_timesteps, initial=step, unit="step", unit_scale=True, dynamic_ncols=True)
-
-        def show(step, text, always=False):
-            bar.set_postfix_str(text, refresh=False)
-            bar.update(step - bar.n)
-
-        return show
-    start, last = (time.time(), step), [0.0]
-
-    def show(step, text, always=False):
-        if always or time.time() - last[0] > 10:
-            last[0] = time.time()
-            left = (args.total_timesteps - step) * (time.time() - start[0]) / max(step - start[1], 1)
-            print(f"{step}/{args.total_timesteps} steps, {text}, {left / 60:.1f} min left", flush=True)
-
-    return show
-
-
-def library_versions():
-    names = ("torch", "gymnasium", "mujoco", "numpy", "tyro", "tensorboard", "wandb")
-    return {"python": sys.version.split()[0], **{name: version(name) for name in names}}
-
-
-def save_policy(args, folder, result, policy, mean, inv_std):
-    """policy.pt: the best member with its normalizer, and what is needed to play it."""
-    content = {
-        "format": 1,
-        "policy": torch.from_numpy(policy),
-        "sizes": list(policy_sizes(args)),
-        "obs_mean": torch.from_numpy(mean),
-        "obs_inv_std": torch.from_numpy(inv_std),
-        "args": args.flags,
-        "max_episode_steps": args.max_episode_steps,
-        "id": result["best_id"],
-        "report_return": result["best"],
-    }
-    save_atomically(content, folder / "policy.pt")
-
-
-def save_crossover(args, folder, round, couples, ids, parents, children, pi_s, stats):
-    """crossover_NNN.pt: a round's parents, children, pi_S and normalizer."""
-    content = {
-        "format": 1,
-        "args": args.flags,
-        "max_episode_steps": args.max_episode_steps,
-        "round": round + 1,
-        "couples": couples,
-        "ids": ids,
-        "fitness": torch.from_numpy(parents.fitness),
-        "parents": parents.policies.cpu(),
-        "children": children.cpu(),
-        "pi_s": None if pi_s is None else pi_s.cpu(),
-        "obs_mean": torch.from_numpy(stats.mean[0]),
-        "obs_inv_std": torch.from_numpy(stats.inv_std[0]),
-    }
-    save_atomically(content, folder / f"crossover_{round + 1:03d}.pt")
+def close_run(args, run, population):
+    """Final evaluation, policy.pt and evaluation.json; returns the latter's content."""
+    stats, ids = statistics(population), population.ids.tolist() if len(population.ids) else []
+    result = final_evaluation(args, make_policy(population.policies, args), stats, ids)
+    per_member = evaluation_cost(args, args.selection_episodes) + 2 * evaluation_cost(args, args.report_episodes)
+    run.progress["evaluation_steps"] += len(result["members"]) * per_member
+    result |= {name: run.progress[name] for name in ("global_step", "evaluation_steps")}
+    save_policy(args, run.folder, result, population.policies, stats)
+    if world()[0] == 0:
+        (run.folder / "evaluation.json").write_text(json.dumps(result, indent=1) + "\n")
+        run.log({"eval/episodic_return": result["best"], "eval/mean_return": result["mean"]})
+        minutes = (time.perf_counter() - run.start) / 60
+        run.show(
+            f"best {result['best']:.1f} +- {result['best_std']:.1f} (member {result['best_id']}), mean of members"
+            f" {result['mean']:.1f}, {args.report_episodes} episodes each; {minutes:.1f} min; everything is in {run.folder}",
+            final=True,
+        )
+    return result
 
 
 # ---------------------------------------------------------------- what one sees
 
 
-def gaussian_entropy(log_std):
-    return (log_std + 0.5 * math.log(2 * math.pi * math.e)).sum().item()
+def make_log(args, run):
+    """log(scalars): to TensorBoard and, with --track, to W&B; both get one monotone step, the total of environment steps."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    step = run.progress["global_step"]
+    writer = SummaryWriter(run.folder, purge_step=step + 1 if step else None)
+    writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in args.flags.items()))
+    if args.track:
+        import wandb
+
+        name = run.folder.name
+        wandb.init(
+            **dict(project=args.wandb_project_name, entity=args.wandb_entity, name=name, id=name, resume="allow"),
+            **dict(config=args.flags, save_code=True, dir=run.folder),
+        )
+
+    def log(scalars):
+        for name, value in scalars.items():
+            writer.add_scalar(name, value, run.progress["global_step"])
+        writer.flush()
+        if args.track:
+            wandb.log({**scalars, "global_step": run.progress["global_step"]}, step=run.progress["global_step"])
+
+    return log
 
 
-def explained_variance(values, returns):
+def make_show(args, run):
+    """show(text): one bar on a terminal; elsewhere plain lines, at most one in ten seconds. final=True always shows."""
+    from tqdm import tqdm
+
+    terminal = sys.stderr.isatty()
+    first, start, last = run.progress["global_step"], time.time(), [0.0]
+    bar = tqdm(total=args.budget_steps, initial=first, unit="step", unit_scale=True, disable=not terminal)
+
+    def show(text, final=False):
+        step = run.progress["global_step"]
+        if terminal:
+            bar.update(step - bar.n)
+            bar.set_postfix_str("" if final else text)
+        if final:
+            bar.close()
+            print(text, flush=True)
+        elif not terminal and time.time() - last[0] > 10:
+            last[0] = time.time()
+            left = (args.budget_steps - step) * (time.time() - start) / max(step - first, 1) / 60
+            print(f"{step} steps, {text}, {left:.1f} min left", flush=True)
+
+    return show
+
+
+def member_facts(policy, episodes, values, returns):
+    """What one member (a stack of one) contributes to an iteration's scalars; episodes: (obs, return), values, returns [N]."""
     variance = returns.var()
-    return 1 - (returns - values).var() / variance if variance > 0 else float("nan")
+    return {
+        "episodes": [(ret, len(obs)) for obs, ret in episodes],
+        "losses/value_loss": 0.5 * float(np.square(values - returns).mean()),
+        "losses/explained_variance": 1 - float((returns - values).var() / variance) if variance > 0 else math.nan,
+        "losses/entropy": (policy.log_std + 0.5 * math.log(2 * math.pi * math.e)).sum().item(),
+    }
 
 
-def iteration_scalars(args, facts, progress, seconds):
-    """What is logged after each iteration; facts: one dict per member of the whole population."""
-    episodes = [episode for fact in facts for episode in fact["episodes"]]
-    member_returns = [np.mean([ret for ret, _ in fact["episodes"]]) for fact in facts if fact["episodes"]]
-    scalars = {f"losses/{name}": float(np.mean([f["losses"][name] for f in facts])) for name in facts[0]["losses"]}
-    if episodes:
-        scalars["charts/episodic_return"] = float(np.mean([ret for ret, _ in episodes]))
-        scalars["charts/episodic_length"] = float(np.mean([length for _, length in episodes]))
-        scalars["population/best_return"] = float(np.max(member_returns))
-        scalars["population/mean_return"] = float(np.mean(member_returns))
-        scalars["population/min_return"] = float(np.min(member_returns))
-        scalars["population/std_return"] = float(np.std(member_returns))
-    for slot, fact in enumerate(facts):
-        if fact["episodes"]:
-            scalars[f"population/return_{slot}"] = float(np.mean([ret for ret, _ in fact["episodes"]]))
-        scalars[f"sharing/size_{slot}"] = fact["sharing"]
-    scalars["sharing/mean_size"] = float(np.mean([fact["sharing"] for fact in facts]))
-    scalars["population/round"] = progress["round"] + 1
+def iteration_scalars(args, run, facts, seconds):
+    """What is logged after an iteration; facts: `member_facts` of the whole population; seconds: by phase, of this worker."""
+    progress = run.progress
+    scalars = {name: float(np.mean([fact[name] for fact in facts])) for name in facts[0] if name != "episodes"}
+    scalars |= {f"sharing/size_{i}": fact["sharing/size"] for i, fact in enumerate(facts) if "sharing/size" in fact}
+    returns = {i: np.mean([ret for ret, _ in fact["episodes"]]) for i, fact in enumerate(facts) if fact["episodes"]}
+    if returns:
+        scalars["charts/episodic_return"] = float(np.mean([ret for fact in facts for ret, _ in fact["episodes"]]))
+        scalars["charts/episodic_length"] = float(np.mean([length for fact in facts for _, length in fact["episodes"]]))
+        for name, function in (("best", np.max), ("mean", np.mean), ("min", np.min), ("std", np.std)):
+            scalars[f"population/{name}_return"] = float(function(list(returns.values())))
+        scalars |= {f"population/return_{i}": float(ret) for i, ret in returns.items()}
     scalars["charts/learning_rate"] = args.learning_rate
     scalars["charts/SPS"] = progress["global_step"] / progress["seconds"]
-    phases = ("rollout", "advantages", "sharing", "policy_update", "critic_update")
-    return {**scalars, **{f"time/{phase}": float(s) for phase, s in zip(phases, seconds)}}
+    return {**scalars, **{f"time/{phase}": s for phase, s in seconds.items()}}
 
 
-def crossover_scalars(args, lines, kl, seconds):
-    """What is logged after each crossover; lines: the round's part of lineage.jsonl."""
-    child = np.array([line["child_return"] for line in lines])
-    parents = np.array([line["parent_returns"] for line in lines])
-    names = ("pi_s_accuracy", "share_x", "expert_reward", "student_reward", "distillation_kl")
-    scalars = {f"crossover/{name}": float(np.mean([line[name] for line in lines])) for name in names if name in lines[0]}
-    if "kl_to_parents" in lines[0]:
-        scalars["crossover/kl_to_parents"] = float(np.mean([line["kl_to_parents"] for line in lines]))
-    scalars["crossover/child_return"] = float(child.mean())
-    scalars["crossover/parent_return"] = float(parents.mean())
-    scalars["crossover/child_minus_best_parent"] = float((child - parents.max(1)).mean())
-    scalars["population/diversity"] = float((kl.sum() - np.trace(kl)) / max(kl.size - len(kl), 1))
-    phases = ("select", "pi_s", "dagger", "comparison")
-    return {**scalars, **{f"time/{phase}": float(s) for phase, s in zip(phases, seconds)}}
+def show_iteration(args, run, scalars):
+    best, mean = (scalars.get(f"population/{name}_return", math.nan) for name in ("best", "mean"))
+    segment = f"{run.progress['segment'] + 1}/{len(args.plan)}"
+    run.show(f"round {segment}, best {best:.0f}, mean {mean:.0f}, {scalars['charts/SPS']:.0f} SPS")
 
 
-def progress_text(round, rounds, scalars):
-    best, mean = (scalars.get(f"population/{name}_return", float("nan")) for name in ("best", "mean"))
-    return f"round {round + 1}/{rounds}, best {best:.0f}, mean {mean:.0f}, {scalars['charts/SPS']:.0f} SPS"
+def stopwatch():
+    """lap(phase) adds the seconds since the last lap to a dict, which it returns."""
+    seconds, last = {}, [time.perf_counter()]
+
+    def lap(phase):
+        now = time.perf_counter()
+        seconds[phase] = seconds.get(phase, 0.0) + now - last[0]
+        last[0] = now
+        return seconds
+
+    return lap
 
 
-def crossover_text(round, rounds, scalars):
-    child, parent = scalars["crossover/child_return"], scalars["crossover/parent_return"]
-    return f"round {round + 1}/{rounds} crossed over: children {child:.0f}, their parents {parent:.0f}"
-
-# ---------------------------------------------------------------- the run
+# ---------------------------------------------------------------- one round of mutation, and the run
 
 
-def iterations_per_round(args):
-    """Iterations of mutation in each round; the first rounds get one more where they do not divide evenly.
+def plan_rounds(args):
+    """Iterations of mutation in each round, the first rounds one more where they do not divide evenly; the steps of all.
 
     As many rounds as fit into the budget, each with its crossovers; refuses a budget that not even one fits into.
     """
-    iteration = args.population * args.num_envs * args.num_steps
-    smallest = iteration + crossover_steps(args)
+    if args.population < 2:
+        refuse(f"--population {args.population}: a couple needs at least 2 members; one policy is joint_baseline.py's")
+    smallest = iteration_steps(args) + crossover_steps(args)
     rounds = min(args.rounds, args.total_timesteps // smallest)
     if rounds == 0:
         refuse(f"--total-timesteps {args.total_timesteps}: one round takes {smallest} steps; give at least that")
-    iterations = (args.total_timesteps - rounds * crossover_steps(args)) // iteration
-    return [iterations // rounds + (k < iterations % rounds) for k in range(rounds)]
+    iterations = (args.total_timesteps - rounds * crossover_steps(args)) // iteration_steps(args)
+    plan = [iterations // rounds + (k < iterations % rounds) for k in range(rounds)]
+    return plan, iterations * iteration_steps(args) + rounds * crossover_steps(args)
+
+
+def iteration_steps(args):
+    """Environment steps of one iteration of the whole population."""
+    return args.population * args.num_envs * args.num_steps
+
+
+def start_segment(args, envs, population, slots, segment):
+    """Everything that starts afresh after a checkpoint, which thus need not hold it: nets' buffers, environments, episodes."""
+    obs, _ = envs.reset(seed=sum([env_seeds(args.num_envs, args.seed, "reset", segment, slot) for slot in slots], []))
+    members = SimpleNamespace(policy=make_policy(population.policies, args))
+    members.critic = make_net(population.critics, critic_sizes(args))
+    members.obs, members.open_episodes = obs.reshape(len(obs), -1), [[] for _ in obs]
+    members.diverged = np.zeros(len(slots), bool)
+    return members
+
+
+def collect(args, envs, members, acting, stats, slots, segment, iteration):
+    """One batch per local member: the roll-out, and per member the episodes that ended in it, as (obs, return)."""
+    generators = [rng(args.seed, "noise", segment, iteration, slot) for slot in slots]
+    noise = normal_noise(generators, args.num_steps, args.num_envs, args.act_dim)
+    data = rollout(envs, members.obs, sample_actions(acting, stats, noise), args.num_steps)
+    members.obs = data.last_obs
+    members.diverged |= data.diverged.reshape(len(slots), -1).any(1)
+    finished = finished_episodes(members.open_episodes, data)
+    return data, [sum(finished[i * args.num_envs : (i + 1) * args.num_envs], []) for i in range(len(slots))]
 
 
 @torch.no_grad()
-def train(args):
-    """One worker's part of a whole run."""
-    rank, workers = world()
-    m, slots = args.population, local_slots(args.population)
+def train_gpo(args, update_policies):
+    """One worker's part of Algorithm 1; update_policies is the mutation's policy gradient."""
+    slots = local_slots(args.population)
     n = len(slots)
-    device = torch.device("cuda", rank % torch.cuda.device_count()) if args.cuda else torch.device("cpu")
-    folder = Path(args.run_dir) / args.run_name
-    checkpoint = load_checkpoint(folder) if args.resume else None
-    if checkpoint:
-        population, progress = own_rows(checkpoint["population"], slots), checkpoint["progress"]
-    else:
-        population = new_population(args, slots)
-        progress = {"round": 0, "global_step": 0, "evaluation_steps": 0, "lineage_bytes": 0, "seconds": 0.0}
-    population.policies, population.critics = population.policies.to(device), population.critics.to(device)
-    plan = iterations_per_round(args)
-    start = time.perf_counter() - progress["seconds"]
-
-    if rank == 0:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = lock_folder(folder)  # noqa: F841  held until the process ends
-        log, show = make_logger(args, folder, progress), make_progress(args, progress["global_step"])
-        (folder / "args.json").write_text(json.dumps({**args.flags, "versions": library_versions()}, indent=1) + "\n")
-        os.truncate((folder / "lineage.jsonl").open("a").name, progress["lineage_bytes"])
-        steps = sum(plan) * m * args.num_envs * args.num_steps + len(plan) * crossover_steps(args)
-        print(
-            f"{folder}: {m} members on {workers} worker(s), {len(plan)} rounds of {plan[0]} iterations, horizon"
-            f" {args.max_episode_steps}; {steps} of {args.total_timesteps} steps ({steps // m} per member)",
-            flush=True,
-        )
-    else:
-        log = show = lambda *_, **__: None
-    if not checkpoint:
-        save_checkpoint(args, folder, population, progress)
-
+    population = new_population(args, slots)
+    run = open_run(args, population)
     envs = make_envs(args, n * args.num_envs)
-    for round in range(progress["round"], len(plan)):
-        # Everything starts afresh here: environments, optimizers, open episodes. A checkpoint needs none of them.
-        policy, critic = make_policy(population.policies, args), make_net(population.critics, critic_sizes(args))
-        policy_optimizer, critic_optimizer = adam(policy, args.learning_rate), adam(critic, args.critic_learning_rate)
-        obs, _ = envs.reset(seed=[s for slot in slots for s in env_seeds(args.num_envs, args.seed, "reset", round, slot)])
-        obs = obs.reshape(n * args.num_envs, -1)
-        open_episodes = [[] for _ in obs]
+    for generation in range(run.progress["segment"], len(args.plan)):
+        members = start_segment(args, envs, population, slots, generation)
+        policy, critic = members.policy, members.critic
+        adam(policy), adam(critic)
         pools, recent = [deque() for _ in slots], [deque(maxlen=2) for _ in slots]
-        diverged = np.zeros(n, bool)
-        warmup = min(args.critic_warmup, plan[round] - 1) if round > 0 else 0
+        warmup = min(args.critic_warmup, args.plan[generation] - 1) if generation > 0 else 0
 
-        for iteration in range(plan[round]):
-            clock = [time.perf_counter()]
-            stats = statistics(population)
-            generators = [rng(args.seed, "noise", round, iteration, slot) for slot in slots]
-            noise = normal_noise(generators, args.num_steps, args.num_envs, args.act_dim)
-            data = rollout(envs, obs, sample_actions(policy, stats, noise), args.num_steps)
-            obs = data.last_obs
-            diverged |= data.diverged.reshape(n, -1).any(1)
-            finished = finished_episodes(open_episodes, data)
-            episodes = [[x for e in range(args.num_envs) for x in finished[i * args.num_envs + e]] for i in range(n)]
+        for iteration in range(args.plan[generation]):
+            lap, stats = stopwatch(), statistics(population)
+            data, episodes = collect(args, envs, members, policy, stats, slots, generation, iteration)
             for i in range(n):
-                recent[i].append([ret for _, ret in episodes[i]])
-                pools[i].extend(episodes[i])
-                while sum(len(obs) for obs, _ in pools[i]) - len(pools[i][0][0] if pools[i] else ()) >= args.crossover_pool:
-                    pools[i].popleft()
-            clock.append(time.perf_counter())
-
-            batches, critic_obs, values, returns = make_batches(args, data, policy, critic, stats)
+                remember(args, pools[i], recent[i], episodes[i])
+            lap("rollout")
+            batches, (critic_obs, values, returns, advantages) = make_batches(args, data, policy, critic, stats)
+            set_advantages(args, batches, advantages, advantages)
+            moments = [batch_moments(*batch) for batch in zip(by_member(data.obs, n), returns)]
+            lap("advantages")
             if iteration == 0:
-                # S_i (Section 3.2.2) without i. NaN compares false: nobody borrows from a broken member.
-                everyone = gather_rows(population.policies)
-                kl = [kl_row(policy.rows[i], batches[i].obs, everyone, args) for i in range(n)]
-                similar = [np.flatnonzero(kl[i] < args.kl_sharing_threshold) for i in range(n)]
-                similar = [[j for j in similar[i] if j != slots[i]] if args.data_sharing else [] for i in range(n)]
-            clock.append(time.perf_counter())
+                similar = similar_members(args, population, policy, batches, slots)
             learning = iteration >= warmup
             shared = share(batches) if args.data_sharing and learning else []
-            clock.append(time.perf_counter())
-            losses, kls = [0.0] * n, [0.0] * n
+            lap("sharing")
+            losses = kls = [0.0] * n
             if learning:
                 borrowed = [[shared[j] for j in similar[i]] for i in range(n)]
-                losses, kls = update_policies(args, policy, policy_optimizer, batches, borrowed, population.kl_coefs)
-            clock.append(time.perf_counter())
+                losses, kls = update_policies(args, policy, batches, borrowed, population.kl_coefs)
+            lap("policy_update")
 
-            raw_obs = by_member(data.obs, n)
-            facts = gather(
-                [
-                    {
-                        "episodes": [(ret, len(obs)) for obs, ret in episodes[i]],
-                        "moments": batch_moments(raw_obs[i]),
-                        "mean_square": np.square(returns[i]).mean(),
-                        "sharing": len(similar[i]) + 1,
-                        "losses": {
-                            "policy_loss": losses[i],
-                            "value_loss": 0.5 * np.square(values[i] - returns[i]).mean(),
-                            "approx_kl": kls[i],
-                            "entropy": gaussian_entropy(policy.rows[i].log_std),
-                            "explained_variance": explained_variance(values[i], returns[i]),
-                            "kl_coef": population.kl_coefs[i],
-                        },
-                    }
-                    for i in range(n)
-                ]
-            )
-            for i in range(n):
-                moments, squares = [fact["moments"] for fact in facts], [fact["mean_square"] for fact in facts]
-                update_statistics(args, population, i, moments, squares)
+            facts = [
+                {
+                    **member_facts(policy.rows[i], episodes[i], values[i], returns[i]),
+                    "losses/policy_loss": losses[i],
+                    "losses/approx_kl": kls[i],
+                    "losses/kl_coef": population.kl_coefs[i].item(),
+                    "sharing/size": len(similar[i]) + 1,
+                }
+                for i in range(n)
+            ]
+            gathered = gather(list(zip(facts, moments)))
+            for i in range(n):  # the population shares its normalizer, because policies are compared on the same input
+                update_statistics(args, population, i, [member_moments for _, member_moments in gathered])
+            lap("statistics")
             targets = returns / statistics(population).return_rms[:, None]
-            generators = [rng(args.seed, "critic_shuffle", round, iteration, slot) for slot in slots]
-            update_critics(args, critic, critic_optimizer, critic_obs, targets, generators)
-            clock.append(time.perf_counter())
+            generators = [rng(args.seed, "critic_shuffle", generation, iteration, slot) for slot in slots]
+            update_critics(args, critic, critic_obs, targets, generators)
+            seconds = lap("critic_update")
+            run.progress["global_step"] += iteration_steps(args)
+            run.progress["seconds"] = time.perf_counter() - run.start
+            scalars = iteration_scalars(args, run, [fact for fact, _ in gathered], seconds)
+            run.log(scalars)
+            show_iteration(args, run, scalars)
 
-            progress["global_step"] += m * args.num_envs * args.num_steps
-            progress["seconds"] = time.perf_counter() - start
-            scalars = iteration_scalars(args, facts, progress, np.diff(clock))
-            log(scalars, progress["global_step"])
-            show(progress["global_step"], progress_text(round, len(plan), scalars))
-
-        for i in range(n):
-            if not any(recent[i]):  # nothing ended in the last two iterations: the last that did, else what is open
-                recent[i].append([ret for _, ret in pools[i]][-1:])
-            if not pools[i]:
-                open_pieces = [p for p in open_episodes[i * args.num_envs : (i + 1) * args.num_envs] if p]
-                pools[i].extend((np.concatenate([x[0] for x in p]), float(sum(x[1] for x in p))) for p in open_pieces)
-                recent[i].append([ret for _, ret in pools[i]])
-        fitness = [float(np.mean([r for returns in recent[i] for r in returns])) for i in range(n)]
-        healthy = [not diverged[i] and policy.flat[i].isfinite().all() and critic.flat[i].isfinite().all() for i in range(n)]
-        fitness = np.array(gather([f if ok else math.nan for f, ok in zip(fitness, healthy)]))
-        scalars = breed(args, folder, round, slots, population, progress, policy, batches, fitness, pools)
-        log(scalars, progress["global_step"])
-        progress["round"] += 1
-        progress["seconds"] = time.perf_counter() - start
-        save_checkpoint(args, folder, population, progress)
-        show(progress["global_step"], crossover_text(round, len(plan), scalars), always=True)
+        fitness = [member_fitness(args, members, pools, recent, i) for i in range(n)]
+        breed(args, run, generation, slots, population, policy, batches, np.array(gather(fitness)), pools)
+        run.progress["segment"] += 1
+        run.progress["seconds"] = time.perf_counter() - run.start
+        save_checkpoint(args, run, population)
     envs.close()
-
-    stats, policy = statistics(population), make_policy(population.policies, args)
-    result, steps = final_evaluation(args, policy, stats, [int(i) for i in population.ids])
-    progress["evaluation_steps"] += steps
-    result = {"global_step": progress["global_step"], "evaluation_steps": progress["evaluation_steps"], **result}
-    best = gather([(policy.flat[i].cpu().numpy(), stats.mean[i], stats.inv_std[i]) for i in range(n)])[result["best_slot"]]
-    if rank == 0:
-        save_policy(args, folder, result, *best)
-        (folder / "evaluation.json").write_text(json.dumps(result, indent=1) + "\n")
-        log({"eval/episodic_return": result["best"], "eval/mean_return": result["mean"]}, progress["global_step"])
-        print(
-            f"best {result['best']:.1f} +- {result['best_std']:.1f} (member {result['best_id']}), mean of the population"
-            f" {result['mean']:.1f}, over {args.report_episodes} episodes each; {progress['global_step']} steps"
-            f" in {(time.perf_counter() - start) / 60:.1f} min; everything is in {folder}",
-            flush=True,
-        )
-    return result
+    return close_run(args, run, population)
 
 
-def breed(args, folder, round, slots, population, progress, policy, batches, fitness, pools):
-    """Ends a round: select, crossover, comparison of children with parents; replaces the population's members in place.
+def remember(args, pool, recent, episodes):
+    """Adds an iteration's episodes to a member's recent returns, and to its pool for pi_S, from which the oldest go."""
+    recent.append([ret for _, ret in episodes])
+    pool.extend(episodes)
+    while len(pool) > 1 and sum(len(obs) for obs, _ in pool) - len(pool[0][0]) >= args.crossover_pool:
+        pool.popleft()
 
-    Returns the scalars to log. fitness [m] of everyone, NaN where a member must not breed.
+
+def similar_members(args, population, policy, batches, slots):
+    """S_i without i, per local member i: whose KL[pi_i, pi_j] is below the threshold before the round's mutation."""
+    if not args.data_sharing:
+        return [[] for _ in slots]
+    everyone = gather_rows(population.policies)
+    kl = [kl_row(row, batch.obs, everyone, args) for row, batch in zip(policy.rows, batches)]
+    # NaN compares false: nobody borrows from a broken member
+    return [[j for j in np.flatnonzero(kl[i] < args.kl_sharing_threshold) if j != slots[i]] for i in range(len(slots))]
+
+
+def member_fitness(args, members, pools, recent, i):
+    """Mean return of the episodes that ended in the last two iterations, else of the last that ended, else of the open ones.
+
+    NaN if the member must not breed: not finite, or its simulation diverged. Fills an empty pool with the open episodes.
     """
-    start = time.perf_counter()
+    if not pools[i]:
+        opened = [pieces for pieces in members.open_episodes[i * args.num_envs : (i + 1) * args.num_envs] if pieces]
+        pools[i].extend(join_pieces(pieces) for pieces in opened)
+        recent[i].append([ret for _, ret in pools[i]])
+    finite = all(net.rows[i].flat.isfinite().all() for net in (members.policy, members.critic))
+    if members.diverged[i] or not finite:
+        return math.nan
+    return float(np.mean(sum(recent[i], []) or pools[i][-1][1]))
+
+
+def breed(args, run, generation, slots, population, policy, batches, fitness, pools):
+    """Ends a round: select, crossover, comparison of children with parents. The children replace the population in place.
+
+    policy: the mutated stack; batches: its last; fitness [m], pools: of everyone and of the local members.
+    """
+    lap, stats = stopwatch(), statistics(population)
     parents = SimpleNamespace(policies=gather_rows(population.policies), fitness=fitness)
     kl = np.stack(gather([kl_row(row, batch.obs, parents.policies, args) for row, batch in zip(policy.rows, batches)]))
-    couples = select(args, round, fitness, kl)
-    selected = time.perf_counter()
+    couples = select(args, generation, fitness, kl)
+    lap("select")
+    children, facts, pi_s = crossover(args, generation, slots, couples, parents, gather(pools), stats)
+    lap("crossover")
 
-    stats, pools = statistics(population), gather(pools)
-    children, facts, pi_s = crossover(args, round, slots, couples, parents, pools, stats)
-    crossed = time.perf_counter()
+    compare = (stats, f"comparison {generation}", args.comparison_episodes)
+    parent_returns = gather(list(evaluate(args, policy, *compare).mean(1)))
+    child_returns = gather(list(evaluate(args, make_policy(children, args), *compare).mean(1)))
+    seconds = lap("comparison")
 
-    purpose = f"comparison {round}"
-    parent_returns = gather(list(evaluate(args, make_policy(population.policies, args), stats, purpose, args.comparison_episodes)))
-    child_returns = gather(list(evaluate(args, make_policy(children, args), stats, purpose, args.comparison_episodes)))
-    facts = gather(facts)
-    critics, kl_coefs = gather_rows(population.critics), gather(list(population.kl_coefs))
-    ids = gather([int(i) for i in population.ids])
-    strongest = [max(couple, key=lambda i: fitness[i]) for couple in couples]
+    heirs = [stronger(couples[slot], fitness) for slot in slots]  # a child's critic and beta are those of its stronger parent
+    ids, facts, all_children = gather(population.ids.tolist()), gather(facts), gather_rows(children)
+    all_pi_s = gather_rows(pi_s) if pi_s is not None else None
     population.policies = children
-    population.critics = critics[[strongest[slot] for slot in slots]]
-    population.kl_coefs = np.array([kl_coefs[strongest[slot]] for slot in slots])
-    population.ids = np.array([args.population * (round + 1) + slot for slot in slots])
-    progress["global_step"] += crossover_steps(args)
-    progress["evaluation_steps"] += 2 * args.population * evaluation_cost(args, args.comparison_episodes)
+    population.critics, population.kl_coefs = gather_rows(population.critics)[heirs], gather_rows(population.kl_coefs)[heirs]
+    population.ids = torch.tensor([args.population * (generation + 1) + slot for slot in slots])
+    run.progress["global_step"] += crossover_steps(args)
+    run.progress["evaluation_steps"] += 2 * args.population * evaluation_cost(args, args.comparison_episodes)
 
-    all_children, all_pi_s = gather_rows(children), gather_rows(pi_s) if pi_s is not None else None
-    lines = [
-        {
-            "id": args.population * (round + 1) + slot,
-            "round": round + 1,
-            "slot": slot,
-            "global_step": progress["global_step"],
-            "parents": [ids[i] for i in couples[slot]],
-            "parent_fitness": [float(fitness[i]) for i in couples[slot]],
-            "parent_returns": [float(parent_returns[i].mean()) for i in couples[slot]],
-            "child_return": float(child_returns[slot].mean()),
-            **{name: value for name, value in facts[slot].items() if name != "seconds"},
-        }
-        for slot in range(args.population)
-    ]
+    lines = []
+    for slot, (couple, fact) in enumerate(zip(couples, facts)):
+        line = {"id": args.population * (generation + 1) + slot, "round": generation + 1, "slot": slot}
+        line |= {"global_step": run.progress["global_step"], "parents": [ids[i] for i in couple]}
+        line |= {"parent_fitness": [fitness[i] for i in couple], "parent_returns": [parent_returns[i] for i in couple]}
+        lines.append({**line, "child_return": child_returns[slot], **fact})
+    phases = [line.pop("seconds", {}) for line in lines]
+    seconds |= {phase: max(p[phase] for p in phases) for phase in phases[0]}
     if world()[0] == 0:
-        with open(folder / "lineage.jsonl", "a") as lineage:
+        with open(run.folder / "lineage.jsonl", "a") as lineage:
+            lineage.truncate(run.progress["lineage_bytes"])  # a round that was cut off had perhaps been written
             lineage.writelines(json.dumps(line) + "\n" for line in lines)
             lineage.flush()
             os.fsync(lineage.fileno())
-            progress["lineage_bytes"] = lineage.tell()
-        if round == 0 or args.save_crossovers:
-            save_crossover(args, folder, round, couples, ids, parents, all_children, all_pi_s, stats)
-    seconds = [selected - start, *np.max([f.get("seconds", [0.0, 0.0]) for f in facts], axis=0)]
-    return crossover_scalars(args, lines, kl, [*seconds, time.perf_counter() - crossed])
+            run.progress["lineage_bytes"] = os.path.getsize(run.folder / "lineage.jsonl")
+        if generation == 0 or args.save_crossovers:
+            content = {"format": 1, "flags": args.flags, "max_episode_steps": args.max_episode_steps, "round": generation + 1}
+            content |= {"couples": couples, "ids": ids, "fitness": torch.from_numpy(fitness), "pi_s": all_pi_s}
+            content |= {"parents": parents.policies, "children": all_children}
+            content |= {"mean": torch.from_numpy(stats.mean[0]), "inv_std": torch.from_numpy(stats.inv_std[0])}
+            save_atomically(content, run.folder / f"crossover_{generation + 1:03d}.pt")
+    scalars = crossover_scalars(lines, kl, seconds)
+    run.log(scalars)
+    child, parent = scalars["crossover/child_return"], scalars["crossover/parent_return"]
+    run.show(f"round {generation + 1}/{len(args.plan)} crossed over, children {child:.0f}, their parents {parent:.0f}")
 
 
-def check_args(args):
-    """Refuses what cannot run, and adds what follows from flags and environment: obs_dim, act_dim, the horizon."""
-    positive = "num_envs num_steps total_timesteps rounds learning_rate critic_learning_rate update_epochs kl_target critic_epochs"
-    positive += " critic_minibatch_size crossover_pool crossover_learning_rate crossover_minibatch_size pi_s_epochs dagger_epochs"
-    positive += " comparison_episodes selection_episodes report_episodes student_steps importance_clip"
-    for name in positive.split():
-        if not getattr(args, name) > 0:
-            refuse(f"--{name.replace('_', '-')} {getattr(args, name)}: must be greater than 0")
-    for name in "seed kl_hinge kl_coef kl_sharing_threshold critic_warmup max_restarts dagger_iterations".split():
-        if not getattr(args, name) >= 0:
-            refuse(f"--{name.replace('_', '-')} {getattr(args, name)}: must not be negative")
-    for name in ("gamma", "gae_lambda", "crossover_top", "diversity_weight"):
-        if not 0 <= getattr(args, name) <= 1:
-            refuse(f"--{name.replace('_', '-')} {getattr(args, name)}: must lie between 0 and 1")
-    if args.expert_steps < 10:
-        refuse(f"--expert-steps {args.expert_steps}: must be at least 10, one step in each of ten environments")
-    if args.population < 2:
-        refuse(f"--population {args.population}: a couple needs at least 2 members; for one policy see joint_baseline.py")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    args.workers = args.workers or min(cores, args.population)
-    if not 1 <= args.workers <= args.population:
-        refuse(f"--workers {args.workers}: must lie between 1 and --population {args.population}")
-    if args.cuda and not torch.cuda.is_available():
-        refuse("--cuda: PyTorch sees no CUDA device here; leave the flag out to run on the CPU")
-    check_environment(args)
-    iterations_per_round(args)
-    try:
-        Path(args.run_dir).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        refuse(f"--run-dir {args.run_dir}: {error.strerror}")
-    if not os.access(args.run_dir, os.W_OK):
-        refuse(f"--run-dir {args.run_dir}: this folder cannot be written to")
+def crossover_scalars(lines, kl, seconds):
+    """What is logged after a crossover; lines: the round's part of lineage.jsonl; kl [m, m] among those who could breed."""
+    child, parents = np.array([line["child_return"] for line in lines]), np.array([line["parent_returns"] for line in lines])
+    names = ("pi_s_accuracy", "share_x", "expert_reward", "student_reward", "distillation_kl", "kl_to_parents")
+    scalars = {f"crossover/{name}": float(np.mean([line[name] for line in lines])) for name in names if name in lines[0]}
+    scalars["crossover/child_return"], scalars["crossover/parent_return"] = float(child.mean()), float(parents.mean())
+    scalars["crossover/child_minus_best_parent"] = float((child - parents.max(1)).mean())
+    scalars["population/diversity"] = float((kl.sum() - np.trace(kl)) / (kl.size - len(kl)))
+    return {**scalars, **{f"time/{phase}": s for phase, s in seconds.items()}}
 
 
-def check_environment(args):
-    """Makes the environment once: refuses what a Gaussian policy cannot play, and sets obs_dim, act_dim, the horizon."""
-    try:
-        json_object = isinstance(json.loads(args.env_kwargs), dict)
-    except ValueError:
-        json_object = False
-    if not json_object:
-        refuse(f"--env-kwargs {args.env_kwargs!r}: must be a JSON object, such as '{{\"difficulty\": 0.5}}'")
-    if args.max_episode_steps is not None and args.max_episode_steps < 1:
-        refuse(f"--max-episode-steps {args.max_episode_steps}: must be greater than 0")
-    try:
-        own_limit = gym.spec(args.env_id).max_episode_steps
-        args.max_episode_steps = args.max_episode_steps or min(512, own_limit or 512)
-        envs = make_envs(args, 1)
-    except Exception as error:  # whatever an environment's constructor raises is about the id or its keywords
-        refuse(f"--env-id {args.env_id} --env-kwargs '{args.env_kwargs}': {' '.join(str(error).split())}")
-    for name, space in (("action", envs.single_action_space), ("observation", envs.single_observation_space)):
-        if not isinstance(space, gym.spaces.Box):
-            refuse(f"--env-id {args.env_id}: its {name} space is {space}; only Box is supported")
-    args.obs_dim = math.prod(envs.single_observation_space.shape)
-    args.act_dim = math.prod(envs.single_action_space.shape)
-    envs.close()
-
-
-MAY_CHANGE = {"workers", "max_restarts", "cuda", "run_dir", "run_name", "resume", "track", "wandb_project_name", "wandb_entity"}
-
-
-def parse_args(argv):
-    """The flags, checked, in one namespace; those of a resumed run come from its checkpoint."""
-    cli = dict(args=argv, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
-    args = flatten(tyro.cli(Args, **cli))
-    if args.resume:
-        stored = load_checkpoint(args.resume)["args"]
-        args = flatten(tyro.cli(Args, default=unflatten(stored), **cli))
-        for name, value in vars(args).items():
-            if name not in MAY_CHANGE and value != stored[name]:
-                refuse(f"--{name.replace('_', '-')} {value}: the run was started with {stored[name]}; this cannot change")
-        folder = Path(args.resume).absolute()
-        args.run_dir, args.run_name = str(folder.parent), folder.name
-    args.flags = dict(vars(args), resume=None)
-    check_args(args)
-    if not args.run_name:
-        env_name = args.env_id.replace("/", "-").replace(":", "-")
-        args.run_name = f"{env_name}__{args.exp_name}__{args.seed}__{int(time.time())}"
-    return args
+SCRIPT.update(plan=plan_rounds, train=lambda args: train_gpo(args, ppo_update))
 
 
 def main(argv=None):
-    """Trains, on one worker in this process, on more through torch's launcher; returns the content of evaluation.json."""
+    """Trains, on one worker in this process, on more through torch's launcher. Returns the content of evaluation.json."""
     argv = sys.argv[1:] if argv is None else argv
     args = parse_args(argv)
     if "TORCHELASTIC_RUN_ID" in os.environ:
-        die_with_parent()
-        torch.set_num_threads(1)
-        dist.init_process_group("gloo")
-        if (Path(args.run_dir) / args.run_name / "checkpoint.pt").exists():
-            args.resume = str(Path(args.run_dir) / args.run_name)
-        result = train(args)
-        dist.destroy_process_group()
-        return result
-    if args.workers > 1:
-        return launch(args, argv)
+        start_worker(args)
+    else:
+        lock(Path(args.run_dir) / args.run_name).close()
+        if args.workers > 1:
+            return launch(args, argv)
     torch.set_num_threads(1)
-    return train(args)
+    try:
+        return SCRIPT["train"](args)
+    except KeyboardInterrupt:
+        print(f"stopped; go on with --resume {Path(args.run_dir) / args.run_name}", file=sys.stderr)
+        raise SystemExit(130) from None
+    finally:
+        if dist.is_initialized():
+            dist.destroy_process_group()
 
 
 if __name__ == "__main__":
