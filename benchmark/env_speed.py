@@ -215,6 +215,7 @@ def circumstances(args: argparse.Namespace) -> dict:
         cpu = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), cpu)
     versions = {name: importlib.metadata.version(name) for name in ("mujoco", "gymnasium", "numpy")}
     versions["envpool"] = envpool.__version__ if envpool else ""
+    versions = {f"{name}_version": version for name, version in versions.items()}
     return {
         "cores": args.cores,
         "of_cores": os.cpu_count(),

@@ -9,7 +9,7 @@ import gymnasium as gym
 
 from gpo_envs import gymnasium_tasks, rllab
 
-HORIZON = 512  # steps per episode in the paper, section 4
+HORIZON = 512  # steps of an episode in the paper, "Other Hyperparameters"
 
 
 def entry_point(creator: type) -> str:
