@@ -1,6 +1,6 @@
 """Draws the pictures of docs/environments.md.
 
-    MUJOCO_GL=egl python -m benchmark.render_envs        # or osmesa; neither needs a screen
+    MUJOCO_GL=egl python -m benchmark.render_envs        # needs no screen
 
 Each task is shown under a gentle random policy; the hilly ones also at three difficulties, seen from further away.
 """

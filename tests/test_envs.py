@@ -87,6 +87,24 @@ def test_equals_gymnasium_for_long(env_id):
     assert_equal_to_gymnasium(env_id, steps=5000, num_envs=5, seed=123)
 
 
+def another(value):
+    """A value that differs from a keyword's default."""
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, tuple):
+        return tuple(0.9 * bound for bound in value)
+    return value + 1 if isinstance(value, int) else 1.5 * value
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", gymnasium_tasks.TASKS, ids=GYMNASIUM_IDS)
+def test_every_keyword_equals_gymnasium(task):
+    for name, default in task.keywords().items():
+        if name != "xml_file":
+            keyword = {name: another(default)}
+            assert assert_equal_to_gymnasium(task.env_id, steps=80, max_episode_steps=20, **keyword) >= 8, keyword
+
+
 @pytest.mark.parametrize("env_id", ["Ant-v5", "InvertedDoublePendulum-v4"])
 def test_equals_gymnasium_with_actions_in_double_precision(env_id):
     assert assert_equal_to_gymnasium(env_id, steps=300, dtype=np.float64, max_episode_steps=50) >= 12
