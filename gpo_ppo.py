@@ -214,7 +214,7 @@ class Args:
     environment: Environment = field(default_factory=Environment)
     budget: Budget = field(default_factory=Budget)
     rounds: Rounds = field(default_factory=Rounds)
-    mutate: PolicyGradient = field(default_factory=PolicyGradient)
+    policy_gradient: PolicyGradient = field(default_factory=PolicyGradient)
     ppo: PPO = field(default_factory=PPO)
     sharing: Sharing = field(default_factory=Sharing)
     select: Select = field(default_factory=Select)
@@ -290,7 +290,7 @@ def parse_args(argv):
 
 
 def rng(seed, purpose, *indices):
-    """A generator of its own for each use, e.g. rng(1, "noise", generation, iteration, member).
+    """A generator of its own for each use, e.g. rng(1, "noise", segment, iteration, member).
 
     No stream is shared, so results depend neither on the number of workers nor on what ran before a checkpoint.
     """
@@ -654,10 +654,10 @@ def policy_gradient_terms(policy, batch, clip):
 
 
 def ppo_gradient(policy, batches, kl_coef, importance_clip=math.inf):
-    """Adds to policy.grad the gradient of one member's -L^PPO with data-sharing (Section 3.2.2); returns its loss.
+    """Adds to policy.grad the gradient of one member's -L^PPO (Section 3.2.2); returns its loss.
 
-    batches: the member's own, then the borrowed. Their surrogates are summed; on the own, kl_coef * KL[old, new] is
-    subtracted, and ratios are not clipped. With v = exp(2 log_std): d KL / d mean = (mean - old) / v and
+    batches: the member's own, then any of other policies. Their surrogates are summed; on the own, kl_coef * KL[old, new]
+    is subtracted, and ratios are not clipped. With v = exp(2 log_std): d KL / d mean = (mean - old) / v and
     d KL / d log_std = 1 - (v_old + (mean - old)^2) / v.
     """
     loss = 0.0
@@ -687,7 +687,10 @@ def adapt_kl_coef(args, kl_coef, kl):
 
 
 def ppo_update(args, policy, batches, borrowed, kl_coefs):
-    """PPO's full-batch steps for a stack; adapts kl_coefs in place. Returns losses and KLs, one per member."""
+    """PPO's full-batch steps for a stack; adapts kl_coefs in place. Returns losses and KLs, one per member.
+
+    batches: each member's own; borrowed: per member a list of others' batches, perhaps empty.
+    """
     losses, kls = [0.0] * len(batches), [0.0] * len(batches)
     for _ in range(args.update_epochs):
         policy.grad.zero_()
@@ -1011,7 +1014,7 @@ def final_evaluation(args, policy, stats, ids):
             means = {f"{name}_return": float(x.mean()) for name, x in returns.items()}
             members.append({"id": member, **means, "report_std": float(report[i].std())})
     members = gather(members)
-    best = max(members, key=lambda member: member["selection_return"])
+    best = max(members, key=lambda member: np.nan_to_num(member["selection_return"], nan=-math.inf))
     return {
         "best": best["report_return"],
         "best_std": best["report_std"],
@@ -1048,9 +1051,16 @@ def gather(values):
     return [value for part in parts for value in part]
 
 
-def gather_rows(stack):
-    """The rows of all workers' stacks, in member order, as one stack on the same device."""
-    return torch.from_numpy(np.stack(gather(list(stack.cpu().numpy())))).to(stack.device)
+def gather_rows(stack, sizes=None):
+    """The rows of all workers' stacks, in member order, as one stack on the same device; sizes: rows per worker, if known."""
+    if world()[1] == 1:
+        return stack.clone()
+    sizes = sizes or gather([len(stack)])
+    padded = torch.zeros(max(sizes), *stack.shape[1:], dtype=stack.dtype)
+    padded[: len(stack)] = stack
+    parts = torch.empty(len(sizes) * max(sizes), *stack.shape[1:], dtype=stack.dtype)
+    dist.all_gather_single(parts, padded)
+    return torch.cat([part[:size] for part, size in zip(parts.split(max(sizes)), sizes)]).to(stack.device)
 
 
 def launch(args, argv):
@@ -1168,7 +1178,7 @@ def lock(folder):
 def open_run(args, population):
     """The run's folder, progress, log(scalars) and show(text), and its population: the given one, or the checkpoint's."""
     run = SimpleNamespace(folder=Path(args.run_dir) / args.run_name, log=lambda *_: None, show=lambda *_: None)
-    run.progress = {"segment": 0, "global_step": 0, "evaluation_steps": 0, "seconds": 0.0, "lineage_bytes": 0}
+    run.progress = {"segment": 0, "global_step": 0, "evaluation_steps": 0, "seconds": 0.0}
     if args.resume:
         checkpoint = load_checkpoint(args.resume)
         run.progress = checkpoint["progress"]
@@ -1187,7 +1197,7 @@ def open_run(args, population):
             print("gpo_envs is not here: environments are stepped by Gymnasium's SyncVectorEnv", flush=True)
         steps = args.budget_steps
         print(
-            f"{run.folder}: {args.population} members, {world()[1]} worker(s), iterations {args.plan}, horizon"
+            f"{run.folder}: population {args.population}, {world()[1]} worker(s), iterations {args.plan}, horizon"
             f" {args.max_episode_steps}; {steps} of {args.total_timesteps} steps, {steps // args.population} per member",
             flush=True,
         )
@@ -1284,7 +1294,6 @@ def iteration_scalars(args, run, facts, seconds):
     """What is logged after an iteration; facts: `member_facts` of the whole population; seconds: by phase, of this worker."""
     progress = run.progress
     scalars = {name: float(np.mean([fact[name] for fact in facts])) for name in facts[0] if name != "episodes"}
-    scalars |= {f"sharing/size_{i}": fact["sharing/size"] for i, fact in enumerate(facts) if "sharing/size" in fact}
     returns = {i: np.mean([ret for ret, _ in fact["episodes"]]) for i, fact in enumerate(facts) if fact["episodes"]}
     if returns:
         scalars["charts/episodic_return"] = float(np.mean([ret for fact in facts for ret, _ in fact["episodes"]]))
@@ -1299,8 +1308,8 @@ def iteration_scalars(args, run, facts, seconds):
 
 def show_iteration(args, run, scalars):
     best, mean = (scalars.get(f"population/{name}_return", math.nan) for name in ("best", "mean"))
-    segment = f"{run.progress['segment'] + 1}/{len(args.plan)}"
-    run.show(f"round {segment}, best {best:.0f}, mean {mean:.0f}, {scalars['charts/SPS']:.0f} SPS")
+    segment = f"{SCRIPT['segment']} {run.progress['segment'] + 1}/{len(args.plan)}"
+    run.show(f"{segment}, best {best:.0f}, mean {mean:.0f}, {scalars['charts/SPS']:.0f} SPS")
 
 
 def stopwatch():
@@ -1418,6 +1427,7 @@ def train_gpo(args, update_policies):
             run.progress["global_step"] += iteration_steps(args)
             run.progress["seconds"] = time.perf_counter() - run.start
             scalars = iteration_scalars(args, run, [fact for fact, _ in gathered], seconds)
+            scalars |= {f"sharing/size_{i}": fact["sharing/size"] for i, (fact, _) in enumerate(gathered)}
             run.log(scalars)
             show_iteration(args, run, scalars)
 
@@ -1500,7 +1510,7 @@ def breed(args, run, generation, slots, population, policy, batches, fitness, po
     seconds |= {phase: max(p[phase] for p in phases) for phase in phases[0]}
     if world()[0] == 0:
         with open(run.folder / "lineage.jsonl", "a") as lineage:
-            lineage.truncate(run.progress["lineage_bytes"])  # a round that was cut off had perhaps been written
+            lineage.truncate(run.progress.get("lineage_bytes", 0))  # a round that was cut off had perhaps been written
             lineage.writelines(json.dumps(line) + "\n" for line in lines)
             lineage.flush()
             os.fsync(lineage.fileno())
@@ -1528,7 +1538,7 @@ def crossover_scalars(lines, kl, seconds):
     return {**scalars, **{f"time/{phase}": s for phase, s in seconds.items()}}
 
 
-SCRIPT.update(plan=plan_rounds, train=lambda args: train_gpo(args, ppo_update))
+SCRIPT.update(segment="round", plan=plan_rounds, train=lambda args: train_gpo(args, ppo_update))
 
 
 def main(argv=None):
