@@ -1117,7 +1117,7 @@ def new_population(args, slots):
         obs_m2=torch.zeros(n, args.obs_dim, dtype=torch.float64),
         return_square=torch.zeros(n, dtype=torch.float64),
         return_weight=torch.zeros(n, dtype=torch.float64),
-        ids=torch.tensor(slots),
+        ids=torch.tensor(slots, dtype=torch.int64),
     )
 
 

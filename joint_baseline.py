@@ -1,0 +1,1237 @@
+# /// script
+# requires-python = ">=3.11"
+# dependencies = [
+#     "torch==2.13.0",
+#     "numpy==2.4.6",
+#     "gymnasium[mujoco]==1.4.0",
+#     "mujoco==4.0.0",
+#     "tyro==1.0.17",
+#     "tensorboard==2.21.0",
+#     "wandb==0.31.0",
+#     "tqdm==4.70.1",
+# ]
+# ///
+"""One policy with PPO or A2C on a large batch: the Joint baseline of Policy Optimization by Genetic Distillation
+(Gangwani & Peng, ICLR 2018, https://arxiv.org/abs/1711.01012).
+
+The policy learns from --population m shards of num_envs environments, so from a batch m times that of one of m independent
+policies, in as many gradient steps as one of them takes. A shard is what functions here call a member, and has its own
+environments, random numbers and gradient. Example: python joint_baseline.py --env-id HalfCheetah-v4 --algo ppo
+"""
+
+import ctypes
+import fcntl
+import json
+import math
+import os
+import signal
+import sys
+import time
+import warnings
+import zlib
+from dataclasses import dataclass, field, fields
+from importlib.metadata import version
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Annotated, Literal
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # nets this small lose with threads; workers are the parallelism
+import gymnasium as gym
+import numpy as np
+import torch
+import torch.distributed as dist
+import tyro
+from gymnasium.vector import AutoresetMode
+
+try:
+    import gpo_envs  # registers rllab's tasks and batched stepping
+except ModuleNotFoundError as missing:
+    if missing.name != "gpo_envs":
+        raise
+    gpo_envs = None
+
+# ---------------------------------------------------------------- flags; an annotation is the bound that `parse_args` checks
+
+SCRIPT = {}  # what tells this script from its siblings; filled next to the functions that it names, used by `main`
+
+
+@dataclass
+class Experiment:
+    exp_name: str | None = None
+    """the name of this experiment, part of the run's name; default: the script's"""
+    seed: Annotated[int, ">= 0"] = 1
+    """the seed from which every random number of the run follows"""
+    workers: Annotated[int | None, "> 0"] = None
+    """processes that share the work; default: one per core this process may use, at most one per member"""
+    max_restarts: Annotated[int, ">= 0"] = 3
+    """how often a crashed group of workers starts again from the last checkpoint (with more than one worker)"""
+    cuda: bool = False
+    """whether to compute updates on the accelerator (worker r uses device r modulo their number)"""
+    run_dir: str = "runs"
+    """the folder that holds the folders of all runs"""
+    run_name: str | None = None
+    """the name of this run's folder; default: {env_id}__{exp_name}__{seed}__{unix time}"""
+    resume: str | None = None
+    """the folder of a run that stopped: go on from its last checkpoint, with its flags"""
+    track: bool = False
+    """whether to send everything that is logged to Weights & Biases, too"""
+    wandb_project_name: str = "gpo"
+    """the project of Weights & Biases"""
+    wandb_entity: str | None = None
+    """the entity (team) of the Weights & Biases project"""
+
+
+@dataclass
+class Environment:
+    env_id: str = "HalfCheetah-v4"
+    """the id of any Gymnasium environment with Box observations and Box actions"""
+    env_kwargs: str = "{}"
+    """keyword arguments of the environment, as a JSON object"""
+    max_episode_steps: Annotated[int | None, "> 0"] = None
+    """the horizon, in steps; default: the smaller of 512 (the paper's) and the environment's own"""
+    vectorization: Literal["auto", "sync"] = "auto"
+    """auto: batched stepping where gpo_envs serves the id; sync: always Gymnasium's SyncVectorEnv"""
+    num_envs: Annotated[int, "> 0"] = 4
+    """the number of environments per member"""
+    num_steps: Annotated[int, "> 0"] = 512
+    """the number of steps in each environment per iteration; a member's batch is num_envs * num_steps"""
+
+
+@dataclass
+class Budget:
+    total_timesteps: Annotated[int, "> 0"] = 8_000_000
+    """environment steps of the whole run, all members and all phases of training together; never exceeded"""
+    population: Annotated[int, "> 0"] = 8
+    """the number of members, m in the paper"""
+
+
+@dataclass
+class Segments:
+    segments: Annotated[int, "> 0"] = 12
+    """parts of the run, each of which ends with a checkpoint; as many as there are iterations for"""
+
+
+@dataclass
+class Algo:
+    algo: Literal["ppo", "a2c"] = "ppo"
+    """the policy gradient: PPO with its KL penalty, or A2C, to which PPO's flags do not apply"""
+
+
+@dataclass
+class PolicyGradient:
+    learning_rate: Annotated[float, "> 0"] = 3e-3
+    """Adam's learning rate of the policies"""
+    critic_learning_rate: Annotated[float, "> 0"] = 1e-3
+    """Adam's learning rate of the critics"""
+    gamma: Annotated[float, "in [0, 1]"] = 0.99
+    """the discount factor"""
+    gae_lambda: Annotated[float, "in [0, 1]"] = 0.95
+    """the lambda of generalized advantage estimation"""
+    norm_adv: bool = True
+    """whether advantages are normalized to mean 0 and deviation 1 over the batch of a gradient step"""
+    norm_obs: bool = True
+    """whether observations are normalized by running statistics, which are part of the policy"""
+    norm_returns: bool = True
+    """whether the critic's targets are divided by a slowly moving root mean square of the returns"""
+    critic_epochs: Annotated[int, "> 0"] = 10
+    """passes of the critic over each batch"""
+    critic_minibatch_size: Annotated[int, "> 0"] = 256
+    """samples per member and gradient step of the critic"""
+
+
+@dataclass
+class PPO:
+    update_epochs: Annotated[int, "> 0"] = 10
+    """full-batch gradient steps of the policy per iteration of PPO"""
+    kl_coef: Annotated[float, "> 0"] = 1.0
+    """the initial weight of PPO's KL penalty, beta in the paper; it adapts to kl_target"""
+    kl_target: Annotated[float, "> 0"] = 0.01
+    """the KL per iteration (nats) that beta aims at: doubled above 1.5 times, halved below 1/1.5 of it"""
+    kl_hinge: Annotated[float, ">= 0"] = 100.0
+    """the weight of the additional penalty max(0, KL - 2 kl_target)^2; 0 is the paper's loss"""
+
+
+@dataclass
+class Evaluation:
+    selection_episodes: Annotated[int, "> 0"] = 20
+    """episodes per member at the end that choose the best member; outside the budget"""
+    report_episodes: Annotated[int, "> 0"] = 100
+    """episodes per member at the end, on other seeds, that are reported; outside the budget"""
+
+
+@dataclass
+class Args:
+    experiment: Experiment = field(default_factory=Experiment)
+    environment: Environment = field(default_factory=Environment)
+    budget: Budget = field(default_factory=Budget)
+    segments: Segments = field(default_factory=Segments)
+    algo: Algo = field(default_factory=Algo)
+    policy_gradient: PolicyGradient = field(default_factory=PolicyGradient)
+    ppo: PPO = field(default_factory=PPO)
+    evaluation: Evaluation = field(default_factory=Evaluation)
+
+
+BOUNDS = {
+    "> 0": lambda x: 0 < x < math.inf,
+    ">= 0": lambda x: 0 <= x < math.inf,
+    ">= 10": lambda x: x >= 10,
+    "> 0 or inf": lambda x: x > 0,
+    "in [0, 1]": lambda x: 0 <= x <= 1,
+}
+MAY_CHANGE_ON_RESUME = "workers max_restarts cuda run_dir run_name resume track wandb_project_name wandb_entity".split()
+
+
+def refuse(message):
+    """Ends the program for bad input: one line on stderr, exit code 2."""
+    print(f"{Path(sys.argv[0]).name}: error: {message}", file=sys.stderr, flush=True)
+    raise SystemExit(2)
+
+
+def parse_args(argv):
+    """All flags in one namespace (args.seed, not args.experiment.seed), checked; a resumed run's come from its checkpoint.
+
+    Adds what follows from them: flags (the plain values), obs_dim, act_dim, the horizon, workers, the run's name, plan.
+    """
+
+    def parse(default=None):
+        groups = tyro.cli(Args, args=argv, default=default, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
+        return SimpleNamespace(**{name: x for group in vars(groups).values() for name, x in vars(group).items()})
+
+    args = parse()
+    if args.resume:
+        stored = load_checkpoint(args.resume)["flags"]
+        args = parse(Args(**{f.name: f.type(**{g.name: stored[g.name] for g in fields(f.type)}) for f in fields(Args)}))
+        for name, value in vars(args).items():
+            if name not in MAY_CHANGE_ON_RESUME and value != stored[name]:
+                refuse(f"--{name.replace('_', '-')} {value}: the run was started with {stored[name]}, which cannot change")
+        folder = Path(args.resume).absolute()
+        args.run_dir, args.run_name = str(folder.parent), folder.name
+    args.flags = dict(vars(args), resume=None)
+
+    for group in fields(Args):
+        for flag in fields(group.type):
+            value, bounds = getattr(args, flag.name), getattr(flag.type, "__metadata__", ())
+            if value is not None and not all(BOUNDS[bound](value) for bound in bounds):
+                refuse(f"--{flag.name.replace('_', '-')} {value}: must be {bounds[0]}")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    args.workers = args.workers or min(cores, args.population)
+    if args.workers > args.population:
+        refuse(f"--workers {args.workers}: more than --population {args.population}; a worker needs at least one member")
+    if args.cuda and not torch.cuda.is_available():
+        refuse("--cuda: PyTorch sees no CUDA device here; leave the flag out to run on the CPU")
+    check_environment(args)
+    args.plan, args.budget_steps = SCRIPT["plan"](args)
+    if not args.exp_name:
+        args.exp_name = Path(__file__).stem.removesuffix("_baseline") + (f"_{args.algo}" if hasattr(args, "algo") else "")
+    if not args.run_name:
+        args.run_name = f"{args.env_id.replace('/', '-')}__{args.exp_name}__{args.seed}__{int(time.time())}"
+    try:
+        (Path(args.run_dir) / args.run_name).mkdir(parents=True, exist_ok=True)
+        with open(Path(args.run_dir) / args.run_name / ".lock", "a"):
+            pass
+    except OSError as error:
+        refuse(f"--run-dir {args.run_dir}: {error.strerror} ({error.filename})")
+    return args
+
+
+# ---------------------------------------------------------------- randomness
+
+
+def rng(seed, purpose, *indices):
+    """A generator of its own for each use, e.g. rng(1, "noise", segment, iteration, member).
+
+    No stream is shared, so results depend neither on the number of workers nor on what ran before a checkpoint.
+    """
+    return np.random.default_rng([seed, zlib.crc32(purpose.encode()), *indices])
+
+
+def env_seeds(num_envs, seed, purpose, *indices):
+    """One seed per environment, as a list for `envs.reset`."""
+    return rng(seed, purpose, *indices).integers(2**31, size=num_envs).tolist()
+
+
+def normal_noise(generators, num_steps, num_envs, act_dim):
+    """Standard normal numbers [steps, members, envs, act_dim], each member's from its own generator."""
+    return np.stack([g.standard_normal((num_steps, num_envs, act_dim), np.float32) for g in generators], axis=1)
+
+
+def shuffles(generators, samples, epochs, device):
+    """Indices [members, epochs * samples]: a new order of a member's samples for each epoch."""
+    orders = [np.concatenate([g.permutation(samples) for _ in range(epochs)]) for g in generators]
+    return torch.from_numpy(np.stack(orders)).to(device)
+
+
+# ---------------------------------------------------------------- environments
+
+
+def check_environment(args):
+    """Makes the environment once: refuses what a Gaussian policy cannot play, and sets obs_dim, act_dim, the horizon."""
+    try:
+        kwargs = json.loads(args.env_kwargs)
+    except ValueError:
+        kwargs = None
+    if not isinstance(kwargs, dict):
+        refuse(f"--env-kwargs {args.env_kwargs!r}: must be a JSON object, such as '{{\"difficulty\": 0.5}}'")
+    try:
+        own_limit = gym.spec(args.env_id).max_episode_steps
+        args.max_episode_steps = args.max_episode_steps or min(512, own_limit or 512)
+        envs = make_envs(args, 1)
+    except Exception as error:  # whatever is raised here is about the id or its keywords
+        refuse(f"--env-id {args.env_id} --env-kwargs '{args.env_kwargs}': {' '.join(str(error).split())}")
+    for name, space in (("action", envs.single_action_space), ("observation", envs.single_observation_space)):
+        if not isinstance(space, gym.spaces.Box):
+            refuse(f"--env-id {args.env_id}: its {name} space is {space}; only Box is supported")
+    args.obs_dim = math.prod(envs.single_observation_space.shape)
+    args.act_dim = math.prod(envs.single_action_space.shape)
+    envs.close()
+
+
+def make_envs(args, num_envs):
+    """`num_envs` environments with SAME_STEP autoreset: batched where gpo_envs serves the id, else SyncVectorEnv.
+
+    `--vectorization sync` always takes the latter, which is the place for wrappers of your own.
+    """
+    kwargs = {"max_episode_steps": args.max_episode_steps, **json.loads(args.env_kwargs)}
+    served = str(gym.spec(args.env_id).vector_entry_point).startswith("gpo_envs")
+    if not (served and args.vectorization == "auto"):
+        kwargs |= {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": AutoresetMode.SAME_STEP}}
+    with warnings.catch_warnings():
+        # Gymnasium calls v4 tasks out of date and MuJoCo warns of settotalmass in its XML, once per environment.
+        warnings.filterwarnings("ignore", message=".*out of date.*")
+        warnings.filterwarnings("ignore", message=".*settotalmass.*")
+        envs = gym.make_vec(args.env_id, num_envs, **kwargs)
+    assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    return envs
+
+
+def rollout(envs, obs, act, num_steps):
+    """Steps all environments `num_steps` times with SAME_STEP autoreset.
+
+    act(obs [envs, obs_dim], t) returns actions [envs, act_dim]; they are clipped to the Box for the environment only.
+    Returns time-major arrays: obs, next_obs (the true successor, final_obs at an end), actions, rewards, terminations,
+    truncations, dones; last_obs, with which to go on; diverged [envs], simulations that blew up.
+    """
+    num_envs, obs_dim = obs.shape
+    space = envs.single_action_space
+    low, high = space.low.reshape(-1), space.high.reshape(-1)
+    data = SimpleNamespace(
+        obs=np.empty((num_steps, num_envs, obs_dim), np.float32),
+        next_obs=np.empty((num_steps, num_envs, obs_dim), np.float32),
+        actions=np.empty((num_steps, num_envs, low.size), np.float32),
+        rewards=np.empty((num_steps, num_envs)),
+        terminations=np.empty((num_steps, num_envs), bool),
+        truncations=np.empty((num_steps, num_envs), bool),
+        diverged=np.zeros(num_envs, bool),
+    )
+    for t in range(num_steps):
+        data.obs[t] = obs
+        data.actions[t] = actions = act(data.obs[t], t)
+        actions = np.clip(actions, low, high).reshape(num_envs, *space.shape)
+        obs, data.rewards[t], data.terminations[t], data.truncations[t], infos = envs.step(actions)
+        obs = obs.reshape(num_envs, -1)
+        data.next_obs[t] = obs
+        if "final_obs" in infos:
+            for e in np.flatnonzero(data.terminations[t] | data.truncations[t]):
+                data.next_obs[t, e] = infos["final_obs"][e].reshape(-1)
+        if "diverged" in infos:
+            data.diverged |= infos["diverged"]
+    data.dones = data.terminations | data.truncations
+    data.last_obs = obs
+    return data
+
+
+def finished_episodes(open_episodes, data):
+    """Cuts a roll-out at the ends of episodes; returns per environment those that ended, as (obs [L, obs_dim], return).
+
+    open_episodes: per environment a list of (obs, return) pieces that earlier roll-outs left open; updated in place.
+    """
+    finished = []
+    for e, pieces in enumerate(open_episodes):
+        episodes, start = [], 0
+        for end in np.flatnonzero(data.dones[:, e]) + 1:
+            pieces.append((data.obs[start:end, e], data.rewards[start:end, e].sum()))
+            episodes.append(join_pieces(pieces))
+            pieces.clear()
+            start = end
+        if start < len(data.obs):
+            pieces.append((data.obs[start:, e], data.rewards[start:, e].sum()))
+        finished.append(episodes)
+    return finished
+
+
+def join_pieces(pieces):
+    """One episode (obs [L, obs_dim], return) from its pieces."""
+    return np.concatenate([obs for obs, _ in pieces]), float(sum(ret for _, ret in pieces))
+
+
+# ---------------------------------------------------------------- networks: stacks of MLPs, one row of a flat buffer each
+
+
+def policy_sizes(args):
+    return (args.obs_dim, 64, 64, args.act_dim)
+
+
+def critic_sizes(args):
+    return (args.obs_dim, 32, 32, 1)
+
+
+def make_net(flat, sizes, log_std=False, grad=None):
+    """Views into a stack of MLPs, flat [members, P], and its gradient.
+
+    Per layer (W [members, out, in], b [members, out, 1]) and the same of the gradient; log_std [members, act_dim, 1];
+    rows: each member as a stack of one in the same memory.
+    """
+    net = SimpleNamespace(flat=flat, grad=torch.zeros_like(flat) if grad is None else grad, layers=[], sizes=sizes)
+    at = 0
+    for n_in, n_out in zip(sizes, sizes[1:]):
+        W, W_grad = (x[:, at : at + n_out * n_in].view(-1, n_out, n_in) for x in (net.flat, net.grad))
+        at += n_out * n_in
+        b, b_grad = (x[:, at : at + n_out, None] for x in (net.flat, net.grad))
+        at += n_out
+        net.layers.append((W, b, W_grad, b_grad))
+    if log_std:
+        net.log_std, net.log_std_grad = (x[:, at : at + sizes[-1], None] for x in (net.flat, net.grad))
+    members = range(len(flat)) if len(flat) > 1 else ()
+    net.rows = [make_net(flat[i : i + 1], sizes, log_std, net.grad[i : i + 1]) for i in members] or [net]
+    return net
+
+
+def make_policy(flat, args):
+    return make_net(flat, policy_sizes(args), log_std=True)
+
+
+def init_rows(generators, sizes, output_std, log_std=False):
+    """Orthogonally initialized MLPs [members, P], one per generator; biases and log-std 0.
+
+    P is padded to a multiple of 16, so that vectorized kernels treat a member alike wherever its row stands.
+    """
+    count = sum(n_out * n_in + n_out for n_in, n_out in zip(sizes, sizes[1:])) + log_std * sizes[-1]
+    flat = torch.zeros(len(generators), math.ceil(count / 16) * 16)
+    net = make_net(flat, sizes)
+    for i, generator in enumerate(generators):
+        torch_generator = torch.Generator().manual_seed(int(generator.integers(2**62)))
+        for W, *_ in net.layers:
+            std = output_std if W is net.layers[-1][0] else math.sqrt(2)
+            torch.nn.init.orthogonal_(W[i], std, generator=torch_generator)
+    return flat
+
+
+def tanh_(x):
+    """tanh in place; on the CPU NumPy's is several times faster than torch's."""
+    return x.tanh_() if x.is_cuda else torch.from_numpy(np.tanh(x.numpy(), out=x.numpy()))
+
+
+def forward(net, x):
+    """Activations [x, h1, h2, output] of a stack; x is [members, in, samples]: columns are samples, as in Wx + b."""
+    activations = [x]
+    for W, b, *_ in net.layers[:-1]:
+        activations.append(tanh_(torch.baddbmm(b, W, activations[-1])))
+    W, b, *_ = net.layers[-1]
+    return [*activations, torch.baddbmm(b, W, activations[-1])]
+
+
+def backward(net, activations, grad):
+    """Adds to net.grad the gradient of a loss whose derivative with respect to the output is grad [members, out, samples].
+
+    Written out, since autograd's bookkeeping costs more than these small products: with h the input of a layer,
+    dW = grad h^T, db = sum of grad; and below, through W and tanh, grad <- (W^T grad) (1 - h^2).
+    """
+    for (W, _, W_grad, b_grad), h in zip(reversed(net.layers), reversed(activations[:-1])):
+        W_grad.add_(torch.bmm(grad, h.mT))
+        b_grad.add_(grad.sum(-1, keepdim=True))
+        if h is not activations[0]:
+            grad = torch.bmm(W.mT, grad)
+            grad.addcmul_(grad * h, h, value=-1)
+
+
+def adam_step(net, learning_rate):
+    """One step of Adam (https://arxiv.org/abs/1412.6980) by net.grad; element by element, so members do not mix.
+
+    This is the kernel of torch.optim.Adam(fused=True); the class around it costs several times the kernel here.
+    """
+    mean, square, step = net.moments
+    torch._fused_adam_(
+        *([net.flat], [net.grad], [mean], [square], [], [step.add_(1)]),
+        **dict(lr=learning_rate, beta1=0.9, beta2=0.999, eps=1e-5, weight_decay=0.0, amsgrad=False, maximize=False),
+    )
+
+
+def fit(net, rows, output_gradient, indices, minibatch_size, step):
+    """Minibatch gradient descent of a stack; step() uses net.grad.
+
+    rows [members, samples, in + targets]; indices [members, steps * minibatch_size] of samples, in their order of use;
+    output_gradient(output [members, out, minibatch], targets [members, targets, minibatch]) is the loss's derivative.
+    """
+    members, samples, width = rows.shape
+    flat_rows, n_in = rows.reshape(members * samples, width), net.sizes[0]
+    indices = indices + samples * torch.arange(members, device=rows.device)[:, None]
+    for chunk in indices.split(minibatch_size, dim=1):
+        batch = flat_rows.index_select(0, chunk.reshape(-1)).view(members, -1, width).mT
+        activations = forward(net, batch[:, :n_in])
+        net.grad.zero_()
+        backward(net, activations, output_gradient(activations[-1], batch[:, n_in:]))
+        step()
+
+
+# ---------------------------------------------------------------- Gaussian policies
+
+
+def gaussian_log_prob(actions, mean, log_std):
+    """log pi(a|s) [members, samples] of actions and mean [members, act_dim, samples]."""
+    z = (actions - mean) * torch.exp(-log_std)
+    return -0.5 * z.square().sum(1) - log_std.sum(1) - 0.5 * mean.shape[1] * math.log(2 * math.pi)
+
+
+def gaussian_kl(mean_p, log_std_p, mean_q, log_std_q):
+    """KL[p || q] of diagonal Gaussians, [members, samples]."""
+    var_ratio = torch.exp(2 * (log_std_p - log_std_q))
+    squares = ((mean_p - mean_q) * torch.exp(-log_std_q)).square()
+    return (0.5 * (var_ratio + squares - 1) + log_std_q - log_std_p).sum(1)
+
+
+def policy_kl(policy, batch):
+    """Mean KL[old, new] of one member over the states of its batch."""
+    return gaussian_kl(batch.mean, batch.log_std, forward(policy, batch.obs)[-1], policy.log_std).mean().item()
+
+
+def normalize(obs, stats):
+    """Observations as networks see them; obs [..., members, samples, obs_dim] with statistics [members, obs_dim]."""
+    return np.clip((obs - stats.mean[:, None]) * stats.inv_std[:, None], -10, 10)
+
+
+def net_output(net, obs):
+    """A stack's outputs [members, samples, out], for NumPy observations [members, samples, obs_dim], normalized."""
+    x = torch.from_numpy(obs).to(net.flat.device).mT
+    if x.shape[2] == 1:  # a product with a single column takes another route, whose rounding depends on the stack's size
+        return net_output(net, np.repeat(obs, 2, axis=1))[:, :1]
+    return forward(net, x)[-1].mT.cpu().numpy()
+
+
+def sample_actions(policy, stats, noise):
+    """act(obs, t) for `rollout`: Gaussian actions of a stack whose members own equally many environments in a row.
+
+    noise: [steps, members, envs per member, act_dim], standard normal; None for the mean action.
+    """
+    members, std = len(policy.flat), policy.log_std.exp().mT.cpu().numpy()
+
+    def act(obs, t):
+        mean = net_output(policy, normalize(obs.reshape(members, -1, obs.shape[-1]), stats))
+        return (mean if noise is None else mean + std * noise[t]).reshape(len(obs), -1)
+
+    return act
+
+
+# ---------------------------------------------------------------- policy gradients (Section 3.2.2)
+
+
+def generalized_advantages(rewards, values, next_values, terminations, dones, gamma, gae_lambda):
+    """GAE (https://arxiv.org/abs/1506.02438) over time-major arrays [steps, envs].
+
+    A termination ends the value at 0, a truncation bootstraps from next_values, the value of the final observation;
+    either cuts the sum of lambda-weighted errors.
+    """
+    advantages, lastgaelam = np.empty_like(values), np.zeros_like(values[0])
+    deltas = rewards + gamma * np.where(terminations, 0.0, next_values) - values
+    for t in reversed(range(len(rewards))):
+        advantages[t] = lastgaelam = deltas[t] + gamma * gae_lambda * ~dones[t] * lastgaelam
+    return advantages
+
+
+def by_member(x, members):
+    """Time-major [steps, members * envs, ...] to [members, steps * envs, ...]."""
+    x = x.reshape(len(x), members, -1, *x.shape[2:]).swapaxes(0, 1)
+    return np.ascontiguousarray(x).reshape(members, -1, *x.shape[3:])
+
+
+def make_batches(args, data, policy, critic, stats):
+    """A roll-out as one batch per member, with the critic's samples.
+
+    A batch: obs [1, obs_dim, N], actions [1, act_dim, N], mean and log_std of the policy that acted, log_probs [1, N].
+    The critic's: obs [members, N, obs_dim], values, returns and advantages [members, N], raw.
+    """
+    members, device = len(policy.flat), policy.flat.device
+    obs, next_obs = (normalize(by_member(x, members), stats) for x in (data.obs, data.next_obs))
+    obs, next_obs, actions = (torch.from_numpy(x).to(device) for x in (obs, next_obs, by_member(data.actions, members)))
+    columns = obs.mT.contiguous()
+
+    def values_of(x):
+        values = np.concatenate([forward(row, x[i : i + 1])[-1][0].cpu().numpy() for i, row in enumerate(critic.rows)])
+        values = values * stats.return_rms[:, None]
+        return values.reshape(members, args.num_steps, -1).swapaxes(0, 1).reshape(data.rewards.shape)
+
+    values, next_values = values_of(columns), values_of(next_obs.mT)
+    advantages = generalized_advantages(
+        data.rewards, values, next_values, data.terminations, data.dones, args.gamma, args.gae_lambda
+    )
+    batches = []
+    for i, row in enumerate(policy.rows):
+        batch = SimpleNamespace(obs=columns[i : i + 1], actions=actions[i : i + 1].mT.contiguous())
+        batch.mean, batch.log_std = forward(row, batch.obs)[-1], row.log_std.clone()
+        batch.log_probs = gaussian_log_prob(batch.actions, batch.mean, batch.log_std)
+        batches.append(batch)
+    return batches, (obs, *(by_member(x, members) for x in (values, values + advantages, advantages)))
+
+
+def set_advantages(args, batches, advantages, pool):
+    """Gives each batch its advantages [1, N], rows of [members, N]; --norm-adv by the rows of pool that they belong to."""
+    for batch, own, normalizer in zip(batches, advantages, pool):
+        if args.norm_adv:
+            own = (own - normalizer.mean()) / (normalizer.std() + 1e-8)
+        batch.advantages = torch.from_numpy(own.astype(np.float32)[None]).to(batch.obs.device)
+
+
+def policy_gradient_terms(policy, batch, clip):
+    """One batch's part of the surrogate's gradient, for A2C and PPO: mean of ratio * advantage, ratio = pi_i / pi_acting.
+
+    A ratio above clip counts as the clip, detached (as in V-trace, https://arxiv.org/abs/1802.01561). With e = a - mean and
+    v = exp(2 log_std): d log pi / d mean = e / v, d log pi / d log_std = e^2 / v - 1. Adds the latter's part to policy.grad;
+    returns activations, the loss's derivative with respect to the mean [1, act_dim, N], 1 / v, and the loss.
+    """
+    activations = forward(policy, batch.obs)
+    error, inv_var = batch.actions - activations[-1], torch.exp(-2 * policy.log_std)
+    ratio = torch.exp(gaussian_log_prob(batch.actions, activations[-1], policy.log_std) - batch.log_probs).clamp_(max=clip)
+    weight = (ratio * batch.advantages / ratio.shape[1])[:, None]
+    scaled = error * inv_var
+    policy.log_std_grad.sub_((weight * (scaled * error - 1)).sum(-1, keepdim=True))
+    return activations, -weight * scaled, inv_var, -weight.sum().item()
+
+
+def ppo_gradient(policy, batches, kl_coef, importance_clip=math.inf):
+    """Adds to policy.grad the gradient of one member's -L^PPO (Section 3.2.2); returns its loss.
+
+    batches: the member's own, then any of other policies. Their surrogates are summed; on the own, kl_coef * KL[old, new]
+    is subtracted, and ratios are not clipped. With v = exp(2 log_std): d KL / d mean = (mean - old) / v and
+    d KL / d log_std = 1 - (v_old + (mean - old)^2) / v.
+    """
+    loss = 0.0
+    for k, batch in enumerate(batches):
+        clip = importance_clip if k > 0 else math.inf
+        activations, grad, inv_var, batch_loss = policy_gradient_terms(policy, batch, clip)
+        if k == 0:
+            drift, old_var = activations[-1] - batch.mean, torch.exp(2 * batch.log_std)
+            grad.add_(drift * inv_var, alpha=kl_coef / drift.shape[2])
+            kl_grad = 1 - ((old_var + drift.square()) * inv_var).mean(-1, keepdim=True)
+            policy.log_std_grad.add_(kl_grad, alpha=kl_coef)
+        backward(policy, activations, grad)
+        loss += batch_loss
+    return loss
+
+
+def ppo_penalty(args, kl_coef, kl):
+    """The weight of KL's gradient where the KL is kl: beta, and the slope of kl_hinge * max(0, KL - 2 kl_target)^2."""
+    return kl_coef + 2 * args.kl_hinge * max(0.0, kl - 2 * args.kl_target)
+
+
+def adapt_kl_coef(args, kl_coef, kl):
+    """Beta for the next iteration, adapted to the KL of this one (https://arxiv.org/abs/1707.06347, Section 4)."""
+    if kl > 1.5 * args.kl_target:
+        return min(kl_coef * 2, 1e4)
+    return max(kl_coef / 2, 1e-4) if kl < args.kl_target / 1.5 else kl_coef
+
+
+def a2c_gradient(policy, batches, importance_clip=math.inf):
+    """Adds to policy.grad the gradient of one member's -L^A2C (Section 3.2.2); returns its loss.
+
+    batches: the member's own, then any of other policies; summed. The policy is the one that acted in its own, where thus
+    the ratio is 1 and its gradient that of log pi.
+    """
+    loss = 0.0
+    for k, batch in enumerate(batches):
+        clip = importance_clip if k > 0 else math.inf
+        activations, grad, _, batch_loss = policy_gradient_terms(policy, batch, clip)
+        backward(policy, activations, grad)
+        loss += batch_loss
+    return loss
+
+
+def average_gradient(net, sizes):
+    """Puts the mean of all shards' gradients into each row of net.grad; sizes: the shards of each worker.
+
+    Gathered and added in shard order, so that a run's numbers do not depend on the number of workers.
+    """
+    net.grad.copy_(sum(gather_rows(net.grad, sizes)) / sum(sizes))
+
+
+def joint_ppo_update(args, policy, batches, kl_coefs, sizes):
+    """PPO's full-batch steps of the one policy, of which `policy` holds a copy per local shard; adapts kl_coefs in place.
+
+    Returns losses and KLs, one per local shard; beta follows the mean KL over all shards.
+    """
+    kl = 0.0
+    for _ in range(args.update_epochs):
+        policy.grad.zero_()
+        penalty = ppo_penalty(args, kl_coefs[0].item(), kl)
+        losses = [ppo_gradient(row, [own], penalty) for row, own in zip(policy.rows, batches)]
+        average_gradient(policy, sizes)
+        adam_step(policy, args.learning_rate)
+        kls = [policy_kl(row, own) for row, own in zip(policy.rows, batches)]
+        kl = sum(gather_rows(torch.tensor(kls, dtype=torch.float64), sizes).tolist()) / sum(sizes)
+    kl_coefs.fill_(adapt_kl_coef(args, kl_coefs[0].item(), kl))
+    return losses, kls
+
+
+def joint_a2c_update(args, policy, batches, kl_coefs, sizes):
+    """A2C's one full-batch step of the one policy; it has no KL penalty to weigh. Returns losses and KLs per local shard."""
+    policy.grad.zero_()
+    losses = [a2c_gradient(row, [own]) for row, own in zip(policy.rows, batches)]
+    average_gradient(policy, sizes)
+    adam_step(policy, args.learning_rate)
+    return losses, [policy_kl(row, own) for row, own in zip(policy.rows, batches)]
+
+
+def update_joint_critic(args, critic, obs, targets, generators, sizes):
+    """Fits the one critic to all shards' targets by the mean squared error; a minibatch is one of each shard.
+
+    obs [local shards, N, obs_dim], targets [local shards, N].
+    """
+    rows = torch.cat([obs, torch.from_numpy(targets.astype(np.float32)).to(obs.device)[..., None]], dim=2)
+    indices = shuffles(generators, obs.shape[1], args.critic_epochs, obs.device)
+
+    def squared_error_gradient(values, targets):
+        return (values - targets) / values.shape[2]
+
+    def step():
+        average_gradient(critic, sizes)
+        adam_step(critic, args.critic_learning_rate)
+
+    fit(critic, rows, squared_error_gradient, indices, args.critic_minibatch_size, step)
+
+
+def batch_moments(obs, returns):
+    """Of one member's batch: count, mean and sum of squared deviations of raw obs [N, obs_dim]; mean square of returns."""
+    obs = obs.astype(np.float64)
+    mean = obs.mean(0)
+    return len(obs), mean, np.square(obs - mean).sum(0), np.square(returns).mean()
+
+
+def update_statistics(args, population, i, moments):
+    """Adds batches, as moments in the given order, to local member i's statistics (Chan et al. 1979 for observations)."""
+    for count, mean, m2, _ in moments if args.norm_obs else ():
+        old = population.obs_count[i].item()
+        delta = torch.from_numpy(mean) - population.obs_mean[i]
+        population.obs_m2[i] += torch.from_numpy(m2) + delta**2 * (old * count / (old + count))
+        population.obs_mean[i] += delta * (count / (old + count))
+        population.obs_count[i] += count
+    if args.norm_returns:  # an average over about the last 20 iterations
+        population.return_weight[i] = 0.95 * population.return_weight[i] + 1
+        population.return_square[i] = 0.95 * population.return_square[i] + np.mean([m[3] for m in moments])
+
+
+def statistics(population):
+    """What networks use of running statistics: mean, inv_std [members, obs_dim], return_rms [members]; at first 0, 1, 1."""
+    fresh = population.obs_count == 0
+    var = population.obs_m2 / population.obs_count.clamp(min=1)[:, None]
+    var[fresh] = 1
+    square = population.return_square / population.return_weight.clamp(min=1)
+    square[population.return_weight == 0] = 1
+    return SimpleNamespace(
+        mean=population.obs_mean.float().numpy(),
+        inv_std=(1 / (var + 1e-8).sqrt()).float().numpy(),
+        return_rms=(square + 1e-8).sqrt().numpy(),
+    )
+
+
+# ---------------------------------------------------------------- evaluation
+
+
+def evaluate(args, policy, stats, purpose, episodes, mean_action=False):
+    """Raw returns [members, episodes] of complete episodes; all members meet the same starts and the same noise."""
+    members, width = len(policy.flat), min(episodes, 20)
+    envs, returns = make_envs(args, members * width), []
+    for chunk in range(math.ceil(episodes / width)):
+        obs, _ = envs.reset(seed=env_seeds(width, args.seed, purpose, chunk) * members)
+        noise = normal_noise([rng(args.seed, purpose, chunk, 1)], args.max_episode_steps, width, args.act_dim)
+        act = sample_actions(policy, stats, None if mean_action else noise)
+        data = rollout(envs, obs.reshape(members * width, -1), act, args.max_episode_steps)
+        in_first_episode = np.cumsum(data.dones, axis=0) - data.dones == 0
+        returns.append((data.rewards * in_first_episode).sum(0).reshape(members, width))
+    envs.close()
+    return np.concatenate(returns, axis=1)[:, :episodes]
+
+
+def evaluation_cost(args, episodes):
+    """Environment steps of one `evaluate` call per member."""
+    width = min(episodes, 20)
+    return math.ceil(episodes / width) * width * args.max_episode_steps
+
+
+def final_evaluation(args, policy, stats, ids):
+    """Every member plays selection episodes, and report episodes on other seeds; the best is chosen on the first only,
+    because the maximum that won a selection is biased upward. Returns the content of evaluation.json, less the steps.
+    """
+    members = []
+    if ids:
+        selection = evaluate(args, policy, stats, "selection", args.selection_episodes)
+        report, mean_action = (evaluate(args, policy, stats, "report", args.report_episodes, x) for x in (False, True))
+        for i, member in enumerate(ids):
+            returns = {"selection": selection[i], "report": report[i], "mean_action": mean_action[i]}
+            means = {f"{name}_return": float(x.mean()) for name, x in returns.items()}
+            members.append({"id": member, **means, "report_std": float(report[i].std())})
+    members = gather(members)
+    best = max(members, key=lambda member: np.nan_to_num(member["selection_return"], nan=-math.inf))
+    return {
+        "best": best["report_return"],
+        "best_std": best["report_std"],
+        "best_mean_action": best["mean_action_return"],
+        "best_id": best["id"],
+        "best_slot": members.index(best),
+        "mean": float(np.mean([member["report_return"] for member in members])),
+        "selection_episodes": args.selection_episodes,
+        "report_episodes": args.report_episodes,
+        "members": members,
+    }
+
+
+# ---------------------------------------------------------------- workers
+
+
+def world():
+    """(rank, number of workers) of this process."""
+    return (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
+
+
+def local_slots(population):
+    """The members that this worker owns; any split will do."""
+    rank, workers = world()
+    return np.array_split(np.arange(population), workers)[rank].tolist()
+
+
+def gather(values):
+    """Lists of one value per local member, joined over all workers in member order."""
+    if world()[1] == 1:
+        return values
+    parts = [None] * world()[1]
+    dist.all_gather_object(parts, values)
+    return [value for part in parts for value in part]
+
+
+def gather_rows(stack, sizes=None):
+    """The rows of all workers' stacks, in member order, as one stack on the same device; sizes: rows per worker, if known."""
+    if world()[1] == 1:
+        return stack.clone()
+    sizes = sizes or gather([len(stack)])
+    padded = torch.zeros(max(sizes), *stack.shape[1:], dtype=stack.dtype)
+    padded[: len(stack)] = stack
+    parts = torch.empty(len(sizes) * max(sizes), *stack.shape[1:], dtype=stack.dtype)
+    dist.all_gather_single(parts, padded)
+    return torch.cat([part[:size] for part, size in zip(parts.split(max(sizes)), sizes)]).to(stack.device)
+
+
+def launch(args, argv):
+    """Runs this script once per worker through torch's elastic launcher, which restarts the group if a worker crashes."""
+    from torch.distributed.elastic.multiprocessing import SignalException
+    from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
+    from torch.distributed.launcher.api import LaunchConfig, elastic_launch
+
+    config = LaunchConfig(
+        min_nodes=1,
+        max_nodes=1,
+        nproc_per_node=args.workers,
+        run_id=args.run_name,
+        rdzv_backend="c10d",
+        rdzv_endpoint="localhost:0",
+        max_restarts=args.max_restarts,
+        monitor_interval=0.5,
+    )
+    folder = Path(args.run_dir) / args.run_name
+    try:
+        elastic_launch(config, sys.executable)(__file__, *argv, "--run-name", args.run_name)
+    except SignalException as stop:
+        print(f"stopped; go on with --resume {folder}", file=sys.stderr)
+        raise SystemExit(128 + stop.sigval.value) from None
+    except ChildFailedError as failure:
+        code = next(iter(failure.failures.values())).exitcode
+        print(f"a worker ended with exit code {code}; its error is above, its run in {folder}", file=sys.stderr)
+        raise SystemExit(2 if code == 2 else 1) from None
+    return json.loads((folder / "evaluation.json").read_text())
+
+
+def start_worker(args):
+    """Joins the group; a worker that was started again goes on from the run's checkpoint."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG: die with the launcher, however it ends
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the launcher answers it
+    dist.init_process_group("gloo")
+    if (Path(args.run_dir) / args.run_name / "checkpoint.pt").exists():
+        args.resume = str(Path(args.run_dir) / args.run_name)
+
+
+# ---------------------------------------------------------------- a run's folder
+
+
+def new_population(args, slots):
+    """Random policies and critics for the local slots, and empty statistics; every field has one row per member."""
+    n = len(slots)
+    return SimpleNamespace(
+        policies=init_rows([rng(args.seed, "policy", slot) for slot in slots], policy_sizes(args), 0.01, log_std=True),
+        critics=init_rows([rng(args.seed, "critic", slot) for slot in slots], critic_sizes(args), 1.0),
+        kl_coefs=torch.full((n,), getattr(args, "kl_coef", 0.0), dtype=torch.float64),
+        obs_count=torch.zeros(n, dtype=torch.float64),
+        obs_mean=torch.zeros(n, args.obs_dim, dtype=torch.float64),
+        obs_m2=torch.zeros(n, args.obs_dim, dtype=torch.float64),
+        return_square=torch.zeros(n, dtype=torch.float64),
+        return_weight=torch.zeros(n, dtype=torch.float64),
+        ids=torch.tensor(slots, dtype=torch.int64),
+    )
+
+
+def save_atomically(content, path):
+    """Writes beside and renames, so that a reader finds the old file or the new one, never half of one."""
+    beside = path.with_name(path.name + ".tmp")
+    with open(beside, "wb") as file:
+        torch.save(content, file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(beside, path)
+
+
+def save_checkpoint(args, run, population):
+    """All that the rest of the run depends on, as tensors and plain values; every worker calls, the first one writes."""
+    stacks = {name: gather_rows(stack).cpu() for name, stack in vars(population).items()}
+    if world()[0] == 0:
+        content = {"format": 1, "flags": args.flags, "population": stacks, "progress": run.progress}
+        save_atomically(content, run.folder / "checkpoint.pt")
+
+
+def load_checkpoint(folder):
+    """The checkpoint in a run's folder; refuses what is not one."""
+    path = Path(folder) / "checkpoint.pt"
+    if not path.is_file():
+        refuse(f"--resume {folder}: there is no {path.name} in this folder")
+    try:
+        checkpoint = torch.load(path, weights_only=True)
+        expected = {f.name for group in fields(Args) for f in fields(group.type)}
+        if checkpoint["format"] != 1 or set(checkpoint["flags"]) != expected:
+            raise ValueError("another script's or another version's")
+    except Exception as error:
+        reason = " ".join(str(error).split())[:100]
+        refuse(f"--resume {folder}: {path.name} is no checkpoint of this script ({type(error).__name__}: {reason})")
+    return checkpoint
+
+
+def save_policy(args, folder, result, policies, stats):
+    """policy.pt: the best member with its normalizer, and what is needed to play it."""
+    rows = gather(list(zip(policies.cpu(), stats.mean, stats.inv_std)))
+    if world()[0] == 0:
+        policy, mean, inv_std = rows[result["best_slot"]]
+        content = {"format": 1, "flags": args.flags, "max_episode_steps": args.max_episode_steps, "policy": policy.clone()}
+        content |= {"sizes": list(policy_sizes(args)), "mean": torch.from_numpy(mean), "inv_std": torch.from_numpy(inv_std)}
+        save_atomically({**content, "id": result["best_id"], "report_return": result["best"]}, folder / "policy.pt")
+
+
+def lock(folder):
+    """Holds a run's folder for this process; refuses one that a live run holds."""
+    handle = open(folder / ".lock", "a")
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        refuse(f"{folder}: a live run holds this folder; wait for its end or stop it first")
+    return handle
+
+
+def open_run(args, population):
+    """The run's folder, progress, log(scalars) and show(text), and its population: the given one, or the checkpoint's."""
+    run = SimpleNamespace(folder=Path(args.run_dir) / args.run_name, log=lambda *_: None, show=lambda *_: None)
+    run.progress = {"segment": 0, "global_step": 0, "evaluation_steps": 0, "seconds": 0.0}
+    if args.resume:
+        checkpoint = load_checkpoint(args.resume)
+        run.progress = checkpoint["progress"]
+        for name, stack in checkpoint["population"].items():
+            setattr(population, name, stack[local_slots(len(stack))])
+    device = torch.device("cuda", world()[0] % torch.cuda.device_count()) if args.cuda else torch.device("cpu")
+    population.policies, population.critics = population.policies.to(device), population.critics.to(device)
+    run.start = time.perf_counter() - run.progress["seconds"]
+    if world()[0] == 0:
+        run.lock = lock(run.folder)
+        names = ("torch", "gymnasium", "mujoco", "numpy", "tyro", "tensorboard", "wandb")
+        versions = {"python": sys.version.split()[0], **{name: version(name) for name in names}}
+        (run.folder / "args.json").write_text(json.dumps({**args.flags, "versions": versions}, indent=1) + "\n")
+        run.log, run.show = make_log(args, run), make_show(args, run)
+        if gpo_envs is None:
+            print("gpo_envs is not here: environments are stepped by Gymnasium's SyncVectorEnv", flush=True)
+        steps = args.budget_steps
+        print(
+            f"{run.folder}: population {args.population}, {world()[1]} worker(s), iterations {args.plan}, horizon"
+            f" {args.max_episode_steps}; {steps} of {args.total_timesteps} steps, {steps // args.population} per member",
+            flush=True,
+        )
+    if not args.resume:
+        save_checkpoint(args, run, population)
+    return run
+
+
+def close_run(args, run, population):
+    """Final evaluation, policy.pt and evaluation.json; returns the latter's content."""
+    stats, ids = statistics(population), population.ids.tolist() if len(population.ids) else []
+    result = final_evaluation(args, make_policy(population.policies, args), stats, ids)
+    per_member = evaluation_cost(args, args.selection_episodes) + 2 * evaluation_cost(args, args.report_episodes)
+    run.progress["evaluation_steps"] += len(result["members"]) * per_member
+    result |= {name: run.progress[name] for name in ("global_step", "evaluation_steps")}
+    save_policy(args, run.folder, result, population.policies, stats)
+    if world()[0] == 0:
+        (run.folder / "evaluation.json").write_text(json.dumps(result, indent=1) + "\n")
+        run.log({"eval/episodic_return": result["best"], "eval/mean_return": result["mean"]})
+        minutes = (time.perf_counter() - run.start) / 60
+        run.show(
+            f"best {result['best']:.1f} +- {result['best_std']:.1f} (member {result['best_id']}), mean of members"
+            f" {result['mean']:.1f}, {args.report_episodes} episodes each; {minutes:.1f} min; everything is in {run.folder}",
+            final=True,
+        )
+    return result
+
+
+# ---------------------------------------------------------------- what one sees
+
+
+def make_log(args, run):
+    """log(scalars): to TensorBoard and, with --track, to W&B; both get one monotone step, the total of environment steps."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    step = run.progress["global_step"]
+    writer = SummaryWriter(run.folder, purge_step=step + 1 if step else None)
+    writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in args.flags.items()))
+    if args.track:
+        import wandb
+
+        name = run.folder.name
+        wandb.init(
+            **dict(project=args.wandb_project_name, entity=args.wandb_entity, name=name, id=name, resume="allow"),
+            **dict(config=args.flags, save_code=True, dir=run.folder),
+        )
+
+    def log(scalars):
+        for name, value in scalars.items():
+            writer.add_scalar(name, value, run.progress["global_step"])
+        writer.flush()
+        if args.track:
+            wandb.log({**scalars, "global_step": run.progress["global_step"]}, step=run.progress["global_step"])
+
+    return log
+
+
+def make_show(args, run):
+    """show(text): one bar on a terminal; elsewhere plain lines, at most one in ten seconds. final=True always shows."""
+    from tqdm import tqdm
+
+    terminal = sys.stderr.isatty()
+    first, start, last = run.progress["global_step"], time.time(), [0.0]
+    bar = tqdm(total=args.budget_steps, initial=first, unit="step", unit_scale=True, disable=not terminal)
+
+    def show(text, final=False):
+        step = run.progress["global_step"]
+        if terminal:
+            bar.update(step - bar.n)
+            bar.set_postfix_str("" if final else text)
+        if final:
+            bar.close()
+            print(text, flush=True)
+        elif not terminal and time.time() - last[0] > 10:
+            last[0] = time.time()
+            left = (args.budget_steps - step) * (time.time() - start) / max(step - first, 1) / 60
+            print(f"{step} steps, {text}, {left:.1f} min left", flush=True)
+
+    return show
+
+
+def member_facts(policy, episodes, values, returns):
+    """What one member (a stack of one) contributes to an iteration's scalars; episodes: (obs, return), values, returns [N]."""
+    variance = returns.var()
+    return {
+        "episodes": [(ret, len(obs)) for obs, ret in episodes],
+        "losses/value_loss": 0.5 * float(np.square(values - returns).mean()),
+        "losses/explained_variance": 1 - float((returns - values).var() / variance) if variance > 0 else math.nan,
+        "losses/entropy": (policy.log_std + 0.5 * math.log(2 * math.pi * math.e)).sum().item(),
+    }
+
+
+def iteration_scalars(args, run, facts, seconds):
+    """What is logged after an iteration; facts: `member_facts` of the whole population; seconds: by phase, of this worker."""
+    progress = run.progress
+    scalars = {name: float(np.mean([fact[name] for fact in facts])) for name in facts[0] if name != "episodes"}
+    returns = {i: np.mean([ret for ret, _ in fact["episodes"]]) for i, fact in enumerate(facts) if fact["episodes"]}
+    if returns:
+        scalars["charts/episodic_return"] = float(np.mean([ret for fact in facts for ret, _ in fact["episodes"]]))
+        scalars["charts/episodic_length"] = float(np.mean([length for fact in facts for _, length in fact["episodes"]]))
+        for name, function in (("best", np.max), ("mean", np.mean), ("min", np.min), ("std", np.std)):
+            scalars[f"population/{name}_return"] = float(function(list(returns.values())))
+        scalars |= {f"population/return_{i}": float(ret) for i, ret in returns.items()}
+    scalars["charts/learning_rate"] = args.learning_rate
+    scalars["charts/SPS"] = progress["global_step"] / progress["seconds"]
+    return {**scalars, **{f"time/{phase}": s for phase, s in seconds.items()}}
+
+
+def show_iteration(args, run, scalars):
+    best, mean = (scalars.get(f"population/{name}_return", math.nan) for name in ("best", "mean"))
+    segment = f"{SCRIPT['segment']} {run.progress['segment'] + 1}/{len(args.plan)}"
+    run.show(f"{segment}, best {best:.0f}, mean {mean:.0f}, {scalars['charts/SPS']:.0f} SPS")
+
+
+def stopwatch():
+    """lap(phase) adds the seconds since the last lap to a dict, which it returns."""
+    seconds, last = {}, [time.perf_counter()]
+
+    def lap(phase):
+        now = time.perf_counter()
+        seconds[phase] = seconds.get(phase, 0.0) + now - last[0]
+        last[0] = now
+        return seconds
+
+    return lap
+
+
+# ---------------------------------------------------------------- the run
+
+
+def plan_segments(args):
+    """Iterations in each segment, the first segments one more where they do not divide evenly; the steps of all.
+
+    Refuses a budget that not even one iteration fits into.
+    """
+    steps = iteration_steps(args)
+    iterations = args.total_timesteps // steps
+    if iterations == 0:
+        refuse(f"--total-timesteps {args.total_timesteps}: one iteration takes {steps} steps; give at least that")
+    segments = min(args.segments, iterations)
+    plan = [iterations // segments + (k < iterations % segments) for k in range(segments)]
+    return plan, iterations * steps
+
+
+def iteration_steps(args):
+    """Environment steps of one iteration of the whole population."""
+    return args.population * args.num_envs * args.num_steps
+
+
+def start_segment(args, envs, population, slots, segment):
+    """Everything that starts afresh after a checkpoint, which thus need not hold it: nets' buffers, environments, episodes."""
+    obs, _ = envs.reset(seed=sum([env_seeds(args.num_envs, args.seed, "reset", segment, slot) for slot in slots], []))
+    members = SimpleNamespace(policy=make_policy(population.policies, args))
+    members.critic = make_net(population.critics, critic_sizes(args))
+    members.obs, members.open_episodes = obs.reshape(len(obs), -1), [[] for _ in obs]
+    members.diverged = np.zeros(len(slots), bool)
+    return members
+
+
+def add_moments(population):
+    """Gives the population fields for Adam's moments, one row per member, because a run that is resumed goes on with them."""
+    for name, stack in (("policies", population.policies), ("critics", population.critics)):
+        rows = {"mean": torch.zeros_like(stack), "square": torch.zeros_like(stack), "step": torch.zeros(len(stack))}
+        vars(population).update({f"{name}_{moment}": x for moment, x in rows.items()})
+
+
+def continue_adam(population, name, net):
+    """Gives a stack the moments that the population holds for it, in the same memory."""
+    mean, square, step = (getattr(population, f"{name}_{moment}").to(net.flat.device) for moment in ("mean", "square", "step"))
+    net.moments = mean, square, step[0].clone()
+    rows = {"mean": mean, "square": square, "step": net.moments[2].expand(len(net.flat))}  # all rows have made as many steps
+    vars(population).update({f"{name}_{moment}": x for moment, x in rows.items()})
+
+
+def collect(args, envs, members, acting, stats, slots, segment, iteration):
+    """One batch per local member: the roll-out, and per member the episodes that ended in it, as (obs, return)."""
+    generators = [rng(args.seed, "noise", segment, iteration, slot) for slot in slots]
+    noise = normal_noise(generators, args.num_steps, args.num_envs, args.act_dim)
+    data = rollout(envs, members.obs, sample_actions(acting, stats, noise), args.num_steps)
+    members.obs = data.last_obs
+    members.diverged |= data.diverged.reshape(len(slots), -1).any(1)
+    finished = finished_episodes(members.open_episodes, data)
+    return data, [sum(finished[i * args.num_envs : (i + 1) * args.num_envs], []) for i in range(len(slots))]
+
+
+def copies_for(population, n):
+    """n equal copies of the one policy with all that belongs to it, one for each local shard of the batch.
+
+    population: what is saved, a row at the first worker and none at the others. Copies get the same averaged gradients and
+    statistics, so they stay equal to the bit; `kept` is the way back.
+    """
+    rows = {name: gather_rows(stack) for name, stack in vars(population).items()}
+    return SimpleNamespace(**{name: row.expand(n, *row.shape[1:]).clone() for name, row in rows.items()})
+
+
+def kept(copies):
+    """The population that is saved and evaluated: the one policy, at the first worker."""
+    return SimpleNamespace(**{name: rows[: len(local_slots(1))] for name, rows in vars(copies).items()})
+
+
+@torch.no_grad()
+def train_joint(args, update_policy):
+    """One worker's part of the run; update_policy is the policy gradient."""
+    slots = local_slots(args.population)
+    n, sizes = len(slots), gather([len(slots)])
+    population = new_population(args, local_slots(1))
+    add_moments(population)
+    run = open_run(args, population)
+    copies = copies_for(population, n)
+    envs = make_envs(args, n * args.num_envs)
+    for segment in range(run.progress["segment"], len(args.plan)):
+        shards = start_segment(args, envs, copies, slots, segment)
+        policy, critic = shards.policy, shards.critic
+        continue_adam(copies, "policies", policy), continue_adam(copies, "critics", critic)
+
+        for iteration in range(args.plan[segment]):
+            lap, stats = stopwatch(), statistics(copies)
+            data, episodes = collect(args, envs, shards, policy, stats, slots, segment, iteration)
+            lap("rollout")
+            batches, (critic_obs, values, returns, advantages) = make_batches(args, data, policy, critic, stats)
+            whole = gather_rows(torch.from_numpy(np.stack([values, returns, advantages], axis=1)), sizes).numpy()
+            all_values, all_returns, all_advantages = whole.swapaxes(0, 1)  # each [shards, N]
+            set_advantages(args, batches, advantages, [all_advantages] * n)
+            lap("advantages")
+            losses, kls = update_policy(args, policy, batches, copies.kl_coefs, sizes)
+            lap("policy_update")
+
+            moments = [batch_moments(*batch) for batch in zip(by_member(data.obs, n), returns)]
+            finished = [[(ret, len(obs)) for obs, ret in shard] for shard in episodes]
+            finished, moments, losses, kls = zip(*gather(list(zip(finished, moments, losses, kls))))
+            facts = {
+                **member_facts(policy.rows[0], [], all_values, all_returns),
+                "episodes": sum(finished, []),
+                "losses/policy_loss": np.mean(losses),
+                "losses/approx_kl": np.mean(kls),
+                "losses/kl_coef": copies.kl_coefs[0].item(),
+            }
+            for i in range(n):
+                update_statistics(args, copies, i, moments)
+            lap("statistics")
+            targets = returns / statistics(copies).return_rms[:, None]
+            generators = [rng(args.seed, "critic_shuffle", segment, iteration, slot) for slot in slots]
+            update_joint_critic(args, critic, critic_obs, targets, generators, sizes)
+            seconds = lap("critic_update")
+            run.progress["global_step"] += iteration_steps(args)
+            run.progress["seconds"] = time.perf_counter() - run.start
+            scalars = iteration_scalars(args, run, [facts], seconds)
+            run.log(scalars)
+            show_iteration(args, run, scalars)
+
+        run.progress["segment"] += 1
+        save_checkpoint(args, run, kept(copies))
+    envs.close()
+    return close_run(args, run, kept(copies))
+
+
+SCRIPT.update(segment="segment", plan=plan_segments)
+SCRIPT.update(train=lambda args: train_joint(args, {"ppo": joint_ppo_update, "a2c": joint_a2c_update}[args.algo]))
+
+
+def main(argv=None):
+    """Trains, on one worker in this process, on more through torch's launcher. Returns the content of evaluation.json."""
+    argv = sys.argv[1:] if argv is None else argv
+    args = parse_args(argv)
+    if "TORCHELASTIC_RUN_ID" in os.environ:
+        start_worker(args)
+    else:
+        lock(Path(args.run_dir) / args.run_name).close()
+        if args.workers > 1:
+            return launch(args, argv)
+    torch.set_num_threads(1)
+    try:
+        return SCRIPT["train"](args)
+    except KeyboardInterrupt:
+        print(f"stopped; go on with --resume {Path(args.run_dir) / args.run_name}", file=sys.stderr)
+        raise SystemExit(130) from None
+    finally:
+        if dist.is_initialized():
+            dist.destroy_process_group()
+
+
+if __name__ == "__main__":
+    main()
