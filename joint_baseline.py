@@ -416,6 +416,9 @@ def init_rows(generators, sizes, output_std, log_std=False):
     return flat
 
 
+COLUMNS = 4  # kernels round by where a row starts in memory; so many float32 columns make 16 bytes, alike in any stack
+
+
 def tanh_(x):
     """tanh in place; on the CPU NumPy's is several times faster than torch's."""
     return x.tanh_() if x.is_cuda else torch.from_numpy(np.tanh(x.numpy(), out=x.numpy()))
@@ -466,10 +469,14 @@ def fit(net, rows, output_gradient, indices, minibatch_size, step):
     flat_rows, n_in = rows.reshape(members * samples, width), net.sizes[0]
     indices = indices + samples * torch.arange(members, device=rows.device)[:, None]
     for chunk in indices.split(minibatch_size, dim=1):
+        size, more = chunk.shape[1], -chunk.shape[1] % COLUMNS  # more: columns without a gradient
+        if more:
+            chunk = torch.cat([chunk, chunk[:, :1].expand(-1, more)], dim=1)
         batch = flat_rows.index_select(0, chunk.reshape(-1)).view(members, -1, width).mT
         activations = forward(net, batch[:, :n_in])
+        grad = output_gradient(activations[-1][..., :size], batch[:, n_in:, :size])
         net.grad.zero_()
-        backward(net, activations, output_gradient(activations[-1], batch[:, n_in:]))
+        backward(net, activations, torch.nn.functional.pad(grad, (0, more)) if more else grad)
         step()
 
 
@@ -501,10 +508,11 @@ def normalize(obs, stats):
 
 def net_output(net, obs):
     """A stack's outputs [members, samples, out], for NumPy observations [members, samples, obs_dim], normalized."""
+    samples = obs.shape[1]
+    if samples % COLUMNS:
+        obs = np.pad(obs, ((0, 0), (0, -samples % COLUMNS), (0, 0)), mode="edge")
     x = torch.from_numpy(obs).to(net.flat.device).mT
-    if x.shape[2] == 1:  # a product with a single column takes another route, whose rounding depends on the stack's size
-        return net_output(net, np.repeat(obs, 2, axis=1))[:, :1]
-    return forward(net, x)[-1].mT.cpu().numpy()
+    return forward(net, x)[-1].mT.cpu().numpy()[:, :samples]
 
 
 def sample_actions(policy, stats, noise):
