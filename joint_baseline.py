@@ -752,7 +752,8 @@ def evaluate(args, policy, stats, purpose, episodes, mean_action=False):
         act = sample_actions(policy, stats, None if mean_action else noise)
         data = rollout(envs, obs.reshape(members * width, -1), act, args.max_episode_steps)
         in_first_episode = np.cumsum(data.dones, axis=0) - data.dones == 0
-        returns.append((data.rewards * in_first_episode).sum(0).reshape(members, width))
+        rewards = np.ascontiguousarray((data.rewards * in_first_episode).T)  # a row is added alike next to any others
+        returns.append(rewards.sum(1).reshape(members, width))
     envs.close()
     return np.concatenate(returns, axis=1)[:, :episodes]
 
