@@ -518,8 +518,8 @@ def fit(net, rows, output_gradient, indices, minibatch_size, step):
             chunk = torch.cat([chunk, chunk[:, :1].expand(-1, more)], dim=1)
         batch = flat_rows.index_select(0, chunk.reshape(-1)).view(members, -1, width).mT
         activations = forward(net, batch[:, :n_in])
+        net.grad.zero_()  # before output_gradient, which may add the gradient of a log-std
         grad = output_gradient(activations[-1][..., :size], batch[:, n_in:, :size])
-        net.grad.zero_()
         backward(net, activations, torch.nn.functional.pad(grad, (0, more)) if more else grad)
         step()
 
