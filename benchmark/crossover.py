@@ -73,7 +73,8 @@ def compare(args, saved, episodes):
         row = {"couple": k, "first_parent_id": saved.ids[x[k]], "second_parent_id": saved.ids[y[k]]}
         row |= {f"{name}_return": float(means[k]) for name, means in returns.items()}
         first = returns["first_parent"][k]
-        rows.append(row | {f"{name}_relative": float(means[k] / first) if first > 0 else None for name, means in returns.items()})
+        row |= {f"{name}_relative": float(means[k] / first) if first > 0 else None for name, means in returns.items()}
+        rows.append(row)
     return rows, list(returns)
 
 
