@@ -714,13 +714,14 @@ def batch_moments(obs, returns):
 
 def update_statistics(args, population, i, moments):
     """Adds batches, as moments in the given order, to local member i's statistics (Chan et al. 1979 for observations)."""
+    moments = [batch for batch in moments if all(np.isfinite(x).all() for x in batch)]  # a broken member spoils no other
     for count, mean, m2, _ in moments if args.norm_obs else ():
         old = population.obs_count[i].item()
         delta = torch.from_numpy(mean) - population.obs_mean[i]
         population.obs_m2[i] += torch.from_numpy(m2) + delta**2 * (old * count / (old + count))
         population.obs_mean[i] += delta * (count / (old + count))
         population.obs_count[i] += count
-    if args.norm_returns:  # an average over about the last 20 iterations
+    if args.norm_returns and moments:  # an average over about the last 20 iterations
         population.return_weight[i] = 0.95 * population.return_weight[i] + 1
         population.return_square[i] = 0.95 * population.return_square[i] + np.mean([m[3] for m in moments])
 
