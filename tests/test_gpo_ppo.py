@@ -447,6 +447,20 @@ def test_statistics_equal_numpys_over_all_data_of_all_members(make_args):
     np.testing.assert_allclose(stats.return_rms, np.full(n, math.sqrt(square / weight)), rtol=1e-6)
 
 
+def test_statistics_leave_out_a_broken_members_batch(make_args):
+    args, g = make_args(), np.random.default_rng(0)
+    good = [gpo_ppo.batch_moments(g.normal(3, 2, (40, 5)), g.normal(size=40)) for _ in range(2)]
+    bad_obs = gpo_ppo.batch_moments(np.full((40, 5), NAN), np.ones(40))
+    bad_returns = gpo_ppo.batch_moments(np.ones((40, 5)), np.full(40, math.inf))
+    populations = [gpo_ppo.new_population(args, [0]) for _ in range(3)]
+    for population, moments in zip(populations, (good, [bad_obs, good[0], bad_returns, good[1]], [bad_obs, bad_returns])):
+        gpo_ppo.update_statistics(args, population, 0, moments)
+    expected, spared, untouched = map(gpo_ppo.statistics, populations)
+    for name in vars(expected):
+        np.testing.assert_array_equal(getattr(spared, name), getattr(expected, name))
+    assert_identity(untouched)
+
+
 def test_statistics_that_are_switched_off_stay_the_identity(make_args):
     args = make_args(norm_obs=False, norm_returns=False)
     population = gpo_ppo.new_population(args, [0])

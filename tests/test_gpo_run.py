@@ -410,22 +410,28 @@ def test_sharing_uses_other_members_samples(train, tmp_path):
     assert torch.equal(policies["off"], policies["none"]) and not torch.equal(policies["all"], policies["off"])
 
 
-def test_a_broken_member_does_not_breed(train, tmp_path, monkeypatch):
-    """Member 1's policy becomes NaN in round one: the run goes on, and no child descends from it."""
+@pytest.mark.filterwarnings("ignore:.*not within the observation space.*", "ignore:.*NaN value.*")
+@pytest.mark.parametrize("broken_after", [1, 2])
+def test_a_broken_member_does_not_breed_nor_spoil_the_others(broken_after, train, tmp_path, monkeypatch):
+    """Member 1's policy becomes NaN in one of round one's two updates: no child descends from it, all numbers are finite.
+
+    Broken in the first, it collects a batch of NaN, which must enter neither the normalizer nor the others' gradients.
+    """
     update, calls = gpo_ppo.ppo_update, []
 
     def breaking(args, policy, *rest):
         result = update(args, policy, *rest)
         calls.append(1)
-        if len(calls) == 2:
+        if len(calls) == broken_after:
             policy.flat[1] = math.nan
         return result
 
     monkeypatch.setitem(gpo_ppo.SCRIPT, "train", lambda args: gpo_ppo.train_gpo(args, breaking))
     run = train(tmp_path, population=3, total_timesteps=2400)
     assert [line["parents"] for line in run.lineage[:3]] == [[0, 2]] * 3
+    assert len({tuple(line["parents"]) for line in run.lineage[3:]}) == 3
     assert all(math.isfinite(member["report_return"]) for member in run.evaluation["members"])
-    assert run.checkpoint["population"]["policies"].isfinite().all()
+    assert all(stack.isfinite().all() for stack in run.checkpoint["population"].values())
 
 
 # ---------------------------------------------------------------- bad input
