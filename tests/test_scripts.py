@@ -27,6 +27,7 @@ NAMES = ("gpo_ppo", "gpo_a2c", "single_baseline", "joint_baseline")
 SOURCES = {name: (ROOT / f"{name}.py").read_text() for name in NAMES}
 BASELINES = {"single_baseline": single_baseline, "joint_baseline": joint_baseline}
 SCRIPTS = {"gpo_ppo": gpo_ppo, "gpo_a2c": gpo_a2c, **BASELINES}
+RUNS = [("gpo_ppo", {}), ("gpo_a2c", {})] + [(script, {"algo": algo}) for script in BASELINES for algo in ("ppo", "a2c")]
 
 TINY = {
     "env_id": "Pendulum-v1",
@@ -255,12 +256,9 @@ def test_a2c_update_is_one_step_of_adam_for_each_member(make_args):
 # ---------------------------------------------------------------- the run of all four
 
 
-@pytest.mark.parametrize("script", NAMES)
-@pytest.mark.parametrize("algo", ["ppo", "a2c"])
+@pytest.mark.parametrize("script, algo", RUNS)
 def test_a_run_counts_its_steps_meets_its_budget_and_goes_on(script, algo, tmp_path, monkeypatch):
     """Every step of every environment is counted; a run from a checkpoint in its middle ends with the same numbers."""
-    if script not in BASELINES and not script.endswith(algo):
-        pytest.skip("has no --algo")
     module, steps, evaluating = SCRIPTS[script], {True: 0, False: 0}, [False]
     rollout, evaluate, save = module.rollout, module.evaluate, module.save_checkpoint
 
@@ -282,16 +280,23 @@ def test_a_run_counts_its_steps_meets_its_budget_and_goes_on(script, algo, tmp_p
     monkeypatch.setattr(module, "rollout", counting_rollout)
     monkeypatch.setattr(module, "evaluate", marked_evaluate)
     monkeypatch.setattr(module, "save_checkpoint", save_and_keep)
-    own = {"algo": algo} if script in BASELINES else {}
-    result = module.main(command(script, tmp_path, **own))
+    result = module.main(command(script, tmp_path, **algo))
     assert steps == {False: result["global_step"], True: result["evaluation_steps"]}
     assert 1000 - 3 * 2 * 32 < result["global_step"] <= 1000
     again = module.main(["--resume", str(tmp_path / "middle")])
     assert again == result
     for name, stack in load(tmp_path / "run").items():
         assert torch.equal(stack, load(tmp_path / "middle")[name]), name
-    members = 1 if script == "joint_baseline" else 3
-    assert len(result["members"]) == members and all(len(stack) == members for stack in load(tmp_path / "run").values())
+    members, stacks = 1 if script == "joint_baseline" else 3, load(tmp_path / "run")
+    assert len(result["members"]) == members and all(len(stack) == members for stack in stacks.values())
+    if script in BASELINES:  # own statistics of all that was seen, and moments that are not started afresh in a new segment
+        iterations = result["global_step"] // (3 * 2 * 32)
+        assert stacks["obs_count"].tolist() == [result["global_step"] / members] * members
+        assert all(stacks[f"{name}_{moment}"].any() for name in ("policies", "critics") for moment in ("mean", "square"))
+        assert stacks["policies_step"].tolist() == [iterations * {"ppo": 10, "a2c": 1}[algo["algo"]]] * members
+        assert (
+            stacks["critics_step"].tolist() == [iterations * 2 * 2] * members
+        )  # 2 epochs of 2 minibatches per member or shard
 
 
 @pytest.mark.parametrize("total", [192, 1000, 999_999, 8_000_000])
@@ -355,13 +360,10 @@ def test_run_names_tell_the_scripts_apart(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("script", ["gpo_a2c", "single_baseline", "joint_baseline"])
-@pytest.mark.parametrize("algo", ["ppo", "a2c"])
+@pytest.mark.parametrize("script, algo", RUNS)
 def test_results_do_not_depend_on_the_number_of_workers(script, algo, tmp_path):
     """To the bit, with shapes that do not divide into whole vectors."""
-    if script == "gpo_a2c" and algo == "ppo":
-        pytest.skip("has no --algo")
-    odd = {"num_envs": 3, "num_steps": 35, "critic_minibatch_size": 50, **({"algo": algo} if script in BASELINES else {})}
+    odd = {"num_envs": 3, "num_steps": 35, "critic_minibatch_size": 50, **algo}
     run = SCRIPTS[script].main
     results = [run(command(script, tmp_path, workers=w, run_name=w, total_timesteps=1400, **odd)) for w in (1, 2, 3)]
     assert results[0] == results[1] == results[2]
@@ -387,9 +389,6 @@ def test_a_member_of_single_equals_the_same_member_alone(algo, tmp_path, monkeyp
     stacks = load(tmp_path / "run")
     for name in ("policies", "critics", "obs_mean", "return_square"):  # the members are not each other's copies
         assert not torch.equal(stacks[name][0], stacks[name][1]) and not torch.equal(stacks[name][1], stacks[name][2])
-    updates = {"ppo": 10, "a2c": 1}[algo]
-    assert stacks["policies_step"].tolist() == [4 * updates] * 3  # moments are not started afresh in a new segment
-    assert stacks["critics_step"].tolist() == [4 * math.ceil(2 * 105 / 50)] * 3
 
 
 # ---------------------------------------------------------------- Joint
@@ -445,6 +444,18 @@ def test_joint_on_two_processes_equals_one_to_the_bit(tmp_path):
     assert tensors[-1][0] != 1  # beta has adapted
 
 
+@torch.no_grad()
+def test_joint_adapts_beta_to_the_mean_kl_of_its_shards():
+    def kls_and_betas(kl_target):
+        args, policy, _, batches, *_ = joint_problem([0, 1, 2])
+        args.kl_hinge, args.kl_target, kl_coefs = 0.0, kl_target, torch.ones(3, dtype=torch.float64)
+        return joint_baseline.joint_ppo_update(args, policy, batches, kl_coefs, [3])[1], kl_coefs.tolist()
+
+    mean = np.mean(kls_and_betas(1.0)[0])
+    assert kls_and_betas(mean)[1] == [1] * 3
+    assert kls_and_betas(mean / 1.6)[1] == [2] * 3 and kls_and_betas(mean * 1.6)[1] == [0.5] * 3
+
+
 def test_joint_gradient_is_that_of_the_union_of_its_shards():
     args, policy, critic, batches, obs, targets, own = joint_problem([0, 1, 2])
     row = policy.rows[0]
@@ -478,6 +489,21 @@ def test_joint_gradient_is_that_of_the_union_of_its_shards():
     for row in range(SHARDS):
         torch.testing.assert_close(critic.grad[row], one.grad[0], rtol=1e-4, atol=1e-6)
         torch.testing.assert_close(critic.flat[row], one.flat[0], rtol=1e-4, atol=1e-5)
+
+
+def test_joint_normalizes_advantages_over_all_shards_in_a_run(tmp_path, monkeypatch):
+    set_advantages, seen = joint_baseline.set_advantages, []
+
+    def watched(args, batches, advantages, pool):
+        set_advantages(args, batches, advantages, pool)
+        seen.append(torch.cat([batch.advantages for batch in batches]).double())
+
+    monkeypatch.setattr(joint_baseline, "set_advantages", watched)
+    joint_baseline.main(command("joint_baseline", tmp_path))
+    for advantages in seen:
+        assert advantages.shape == (3, 64) and abs(advantages.mean()) < 1e-6
+        assert advantages.std(correction=0) == pytest.approx(1, abs=1e-5)
+        assert abs(advantages.mean(1)).max() > 1e-3
 
 
 # ---------------------------------------------------------------- benchmark/crossover.py
