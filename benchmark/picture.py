@@ -7,6 +7,7 @@ Example: python -m benchmark.picture runs/HalfCheetah-v4__gpo_ppo__1__1700000000
 """
 
 import math
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,9 +16,13 @@ import tyro
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+from matplotlib.collections import LineCollection  # noqa: E402
 from matplotlib.ticker import EngFormatter  # noqa: E402
+from PIL import Image  # noqa: E402
 
 from benchmark import curves as learning  # noqa: E402
+from benchmark.lineage import ancestry, read_lineage  # noqa: E402
 
 # Okabe and Ito's colours, which most colour-blind people tell apart; line styles say the same once more.
 COLORS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"]
@@ -34,6 +39,7 @@ STYLE = {
     **{"axes.spines.top": False, "axes.spines.right": False, "axes.grid": False, "svg.hashsalt": "gpo"},
 }
 RETURN = "Return of an episode"
+PNG_BYTES = 300_000
 
 
 @dataclass
@@ -91,11 +97,119 @@ def band_text(curves):
     return "mean of members, band from worst to best" if "worst to best member" in bands else None
 
 
+def place(lineage, bold):
+    """Where each policy stands in its generation, {id: x}, and the generations, so that edges cross little, bold ones least.
+
+    Generations take turns in being ordered by the mean place of their relatives above, then below (Sugiyama et al. 1981).
+    """
+    size, first = len(lineage.rounds[0]), lineage.rounds[0][0]["id"]
+    generations = [range(first - size, first)] + [[child["id"] for child in children] for children in lineage.rounds]
+    parents = {child["id"]: child["parents"] for children in lineage.rounds for child in children}
+    children = defaultdict(list)
+    for child, couple in parents.items():
+        for parent in couple:
+            children[parent].append(child)
+    x = {policy: place for generation in generations for place, policy in enumerate(generation)}
+
+    def order(generation, relatives):
+        def mean_place(policy):
+            around = relatives.get(policy, [policy])
+            around = bold.intersection(around) or around if policy in bold else around
+            return sum(x[other] for other in around) / len(around)
+
+        x.update({policy: place for place, policy in enumerate(sorted(generation, key=mean_place))})
+
+    for _ in range(8):
+        for generation in generations[-2::-1]:
+            order(generation, children)
+        for generation in generations[1:]:
+            order(generation, parents)
+    return x, generations
+
+
+def birth_returns(lineage):
+    """{id: return} right after crossover; of founders that bred, after their first mutation."""
+    founders = {policy: ret for child in lineage.rounds[0] for policy, ret in zip(child["parents"], child["parent_returns"])}
+    return founders | {child["id"]: child["child_return"] for children in lineage.rounds for child in children}
+
+
+def draw_tree(lineage):
+    """The family tree: rounds downwards, a node per policy, edges to both parents, the winner's ancestry in bold."""
+    bold, returns = set().union(*ancestry(lineage)), birth_returns(lineage)
+    x, generations = place(lineage, bold)
+    y = {policy: depth for depth, generation in enumerate(generations) for policy in generation}
+    width, height = max(4.0, 0.4 * len(generations[0])), max(2.5, 0.62 * len(generations))
+    figure, axes = plt.subplots(figsize=(width + 1.6, height + 0.5), layout="constrained")
+    edges = [(parent, child["id"]) for children in lineage.rounds for child in children for parent in child["parents"]]
+    for color, linewidth, wanted in (("0.78", 0.6, False), ("0.1", 1.7, True)):
+        lines = [[(x[a], y[a]), (x[b], y[b])] for a, b in edges if (b in bold) == wanted]
+        axes.add_collection(LineCollection(lines, colors=color, linewidths=linewidth, zorder=1 + wanted))
+    ids = [policy for generation in generations for policy in generation]
+    colors = plt.get_cmap("viridis").with_extremes(bad="white")
+    nodes = axes.scatter(
+        *([x[i] for i in ids], [y[i] for i in ids]),
+        **dict(c=[returns.get(i, np.nan) for i in ids], cmap=colors, plotnonfinite=True),
+        **dict(s=[380 if i == lineage.winner else 210 for i in ids], edgecolors=["0.1" if i in bold else "0.78" for i in ids]),
+        **dict(linewidths=[4 if i == lineage.winner else 1.7 if i in bold else 0.6 for i in ids], zorder=3),
+    )
+    for i in ids:
+        dark = i in returns and nodes.norm(returns[i]) < 0.6
+        axes.text(x[i], y[i], str(i), ha="center", va="center", fontsize=6, color="white" if dark else "black", zorder=4)
+    rounds = [f"round {children[0]['round']}" for children in lineage.rounds]
+    axes.set_yticks(range(len(generations)), ["founders", *rounds])
+    axes.set(xticks=[], xlim=(-0.7, len(generations[0]) - 0.3), ylim=(len(generations) - 0.5, -0.5))
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+    axes.set_title(f"{'winner' if lineage.finished else 'best of the last round'} {lineage.winner}, its ancestry in bold")
+    axes.set_xlabel("founders: coloured by the return with which they bred, white if they did not", fontsize=7)
+    bar = figure.colorbar(nodes, shrink=0.8, aspect=30, pad=0.02)
+    bar.set_label("Return after crossover")
+    bar.outline.set_visible(False)
+    return figure
+
+
+def draw_crossovers(lineage):
+    """Parents and children: a panel per round, a group of three bars per couple.
+
+    As in the paper relative to the first parent, unless such a parent's return is not positive or near 0: then plain.
+    """
+    bars = [[[*child["parent_returns"], child["child_return"]] for child in children] for children in lineage.rounds]
+    values, many = [np.array(triples) for triples in bars], len(bars[0]) > 16
+    relative = all((returns[:, 0] > 0.1 * returns.max()).all() and returns[:, 0].min() > 0 for returns in values)
+    width, height = max(2.2, (0.16 if many else 0.33) * len(bars[0])), 1.3 if many else 1.75  # inches
+    columns = min(len(values), max(1, min(4, int(11 / width))))
+    rows = math.ceil(len(values) / columns)
+    shape = dict(figsize=(columns * width + 0.5, rows * height + 0.5), squeeze=False, sharey="row")
+    figure, grid = plt.subplots(rows, columns, layout="constrained", **shape)
+    for axes in grid.flat[len(values) :]:
+        axes.set_visible(False)
+    for axes, children, returns in zip(grid.flat, lineage.rounds, values):
+        heights = returns / returns[:, :1] if relative else returns
+        at = np.arange(len(children))
+        for k, (name, color) in enumerate(zip(("first parent", "second parent", "child"), ("#56B4E9", "#0072B2", "#E69F00"))):
+            axes.bar(at + 0.27 * (k - 1), heights[:, k], 0.27, color=color, label=name)
+        axes.axhline(1 if relative else 0, color="0.3", linewidth=0.6)
+        couples = ["{}+{}".format(*child["parents"]) for child in children]
+        axes.set_xticks([] if many else at, [] if many else couples, rotation=90, fontsize=6)
+        axes.tick_params(axis="y", labelsize=7)
+        axes.tick_params(axis="x", length=0)
+        better = int((returns[:, 2] >= returns[:, :2].max(1)).sum())
+        axes.set_title(f"round {children[0]['round']}: {better} of {len(children)} as good as both", fontsize=8)
+    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    figure.supylabel("Return relative to the first parent" if relative else RETURN, fontsize=9)
+    figure.supxlabel("Couple", fontsize=9)
+    return figure
+
+
 def save(figure, folder, name):
-    """NAME.png and NAME.svg; the same data give the same files."""
+    """NAME.svg and NAME.png, the latter in 255 colours and as sharp as PNG_BYTES let it be; equal data give equal files."""
     folder.mkdir(parents=True, exist_ok=True)
-    figure.savefig(folder / f"{name}.png", dpi=150)
     figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+    for dpi in (150, 120, 100, 80, 60):
+        figure.savefig(folder / f"{name}.png", dpi=dpi)
+        Image.open(folder / f"{name}.png").convert("RGB").quantize(255).save(folder / f"{name}.png", optimize=True)
+        if (folder / f"{name}.png").stat().st_size < PNG_BYTES:
+            break
     plt.close(figure)
     print(f"{folder / name}.png and .svg")
 
@@ -111,6 +225,10 @@ def main(argv=None):
         print(options.csv)
     with plt.rc_context(STYLE):
         save(draw_curves(curves), output, "curves")
+        if len(runs) == 1 and (runs[0].folder / "lineage.jsonl").is_file():
+            lineage = read_lineage(runs[0].folder)
+            save(draw_tree(lineage), output, "family_tree")
+            save(draw_crossovers(lineage), output, "crossovers")
 
 
 if __name__ == "__main__":
