@@ -391,6 +391,22 @@ def test_a_member_of_single_equals_the_same_member_alone(algo, tmp_path, monkeyp
         assert not torch.equal(stacks[name][0], stacks[name][1]) and not torch.equal(stacks[name][1], stacks[name][2])
 
 
+@pytest.mark.filterwarnings("ignore")
+def test_a_broken_member_of_single_is_not_the_best_and_harms_no_other(tmp_path, monkeypatch):
+    sound = single_baseline.main(command("single_baseline", tmp_path))
+    new_population = single_baseline.new_population
+
+    def with_a_broken_member(args, slots):
+        population = new_population(args, slots)
+        population.policies[0] = math.nan
+        return population
+
+    monkeypatch.setattr(single_baseline, "new_population", with_a_broken_member)
+    result = single_baseline.main(command("single_baseline", tmp_path, run_name="broken"))
+    assert result["members"][1:] == sound["members"][1:] and math.isnan(result["members"][0]["report_return"])
+    assert result["best_slot"] > 0 and math.isfinite(result["best"])
+
+
 # ---------------------------------------------------------------- Joint
 
 SHARDS, SAMPLES = 3, 35
