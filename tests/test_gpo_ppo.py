@@ -233,6 +233,30 @@ def random_rollout(seed, steps=23, envs=3, obs_dim=2, ends=0.15):
     return data
 
 
+def test_rollout_equals_stepping_gymnasiums_own_environments(line_args):
+    """Successors at the ends of episodes are the final observations; actions are clipped for the environment only."""
+    line_args.max_episode_steps = 12
+    envs, seeds = gpo_ppo.make_envs(line_args, 3), [1, 2, 3]
+    obs, _ = envs.reset(seed=seeds)
+    played = np.random.default_rng(0).normal(0, 2, (40, 3, 1)).astype(np.float32)
+    played[:, 2] = 1.5  # runs away to the right and terminates
+    data = gpo_ppo.rollout(envs, obs.reshape(3, -1), lambda seen, t: played[t], 40)
+    for e, seed in enumerate(seeds):
+        env = gpo_ppo.gym.make("gpo_test/Line-v0", max_episode_steps=12)
+        obs, _ = env.reset(seed=seed)
+        for t in range(40):
+            np.testing.assert_allclose(data.obs[t, e], obs.reshape(-1), rtol=1e-6)
+            obs, reward, terminated, truncated, _ = env.step(np.clip(played[t, e : e + 1], -1, 1))
+            np.testing.assert_allclose(data.next_obs[t, e], obs.reshape(-1), rtol=1e-6)
+            facts = data.rewards[t, e], data.terminations[t, e], data.truncations[t, e], data.dones[t, e]
+            assert facts == (pytest.approx(reward), terminated, truncated, terminated or truncated)
+            if terminated or truncated:
+                obs, _ = env.reset()
+        np.testing.assert_allclose(data.last_obs[e].reshape(-1), obs.reshape(-1), rtol=1e-6)
+    np.testing.assert_array_equal(data.actions, played)
+    assert data.terminations.any() and data.truncations.any() and not data.diverged.any()
+
+
 @pytest.mark.parametrize("gae_lambda", [0.0, 0.95, 1.0])
 def test_gae_is_the_sum_of_discounted_errors_of_an_episode(gae_lambda):
     gamma, data, g = 0.9, random_rollout(5), np.random.default_rng(6)

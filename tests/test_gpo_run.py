@@ -410,6 +410,42 @@ def test_sharing_uses_other_members_samples(train, tmp_path):
     assert torch.equal(policies["off"], policies["none"]) and not torch.equal(policies["all"], policies["off"])
 
 
+@pytest.mark.parametrize("critic_warmup, updates", [(0, 4), (1, 3), (9, 3)])
+def test_first_iterations_after_a_crossover_fit_only_the_critic(critic_warmup, updates, train, tmp_path, monkeypatch):
+    """Two rounds of two iterations; at least one iteration of a round always improves the policies."""
+    update, calls = gpo_ppo.ppo_update, []
+
+    def counting(*args):
+        calls.append(1)
+        return update(*args)
+
+    monkeypatch.setitem(gpo_ppo.SCRIPT, "train", lambda args: gpo_ppo.train_gpo(args, counting))
+    train(tmp_path, critic_warmup=critic_warmup)
+    assert len(calls) == updates
+
+
+def test_a_child_inherits_critic_and_kl_coef_of_its_stronger_parent(train, tmp_path, monkeypatch):
+    breed, rounds = gpo_ppo.breed, []
+
+    def recording(*args):
+        (population,) = [x for x in args if hasattr(x, "critics")]
+        before = {name: getattr(population, name).clone() for name in ("critics", "kl_coefs", "ids")}
+        breed(*args)
+        rounds.append((before, {name: getattr(population, name).clone() for name in before}))
+
+    monkeypatch.setattr(gpo_ppo, "breed", recording)
+    run = train(tmp_path, population=3, total_timesteps=2400, kl_target=0.05, learning_rate=0.01)
+    sides = set()
+    for line in run.lineage:
+        before, after = rounds[line["round"] - 1]
+        side = int(np.argmax(line["parent_fitness"]))
+        heir = before["ids"].tolist().index(line["parents"][side])
+        assert torch.equal(after["critics"][line["slot"]], before["critics"][heir])
+        assert after["kl_coefs"][line["slot"]] == before["kl_coefs"][heir]
+        sides.add(side)
+    assert sides == {0, 1}
+
+
 @pytest.mark.filterwarnings("ignore:.*not within the observation space.*", "ignore:.*NaN value.*")
 @pytest.mark.parametrize("broken_after", [1, 2])
 def test_a_broken_member_does_not_breed_nor_spoil_the_others(broken_after, train, tmp_path, monkeypatch):
