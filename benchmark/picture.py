@@ -6,10 +6,13 @@ finished run also into its TensorBoard events. Needs requirements-benchmark.txt.
 Example: python -m benchmark.picture runs/HalfCheetah-v4__gpo_ppo__1__1700000000
 """
 
+import json
 import math
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Literal
 
 import matplotlib
 import tyro
@@ -17,10 +20,14 @@ import tyro
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
+import torch  # noqa: E402
 from matplotlib.collections import LineCollection  # noqa: E402
 from matplotlib.ticker import EngFormatter  # noqa: E402
 from PIL import Image  # noqa: E402
+from torch.utils.tensorboard import SummaryWriter  # noqa: E402
 
+import gpo_ppo  # noqa: E402
+from benchmark import crossover  # noqa: E402
 from benchmark import curves as learning  # noqa: E402
 from benchmark.lineage import ancestry, read_lineage  # noqa: E402
 
@@ -42,6 +49,9 @@ RETURN = "Return of an episode"
 PNG_BYTES = 300_000
 
 
+NAMES = ("curves", "family_tree", "crossovers", "states")
+
+
 @dataclass
 class Args:
     runs: tyro.conf.Positional[list[Path]]
@@ -50,6 +60,12 @@ class Args:
     """the folder for the pictures; default: that of the first run"""
     csv: Path | None = None
     """a file for the plotted curves, at every hundredth of the budget"""
+    pictures: tuple[Literal[NAMES], ...] = NAMES
+    """which to draw"""
+    couple: int = 0
+    """the couple of round one whose states are shown, counted from the fittest"""
+    episodes: int = 100
+    """roll-outs per policy for the states"""
     scalar: str = learning.MEAN
     """the TensorBoard scalar on the learning curves' y-axis; default: the mean return of all members"""
 
@@ -201,6 +217,90 @@ def draw_crossovers(lineage):
     return figure
 
 
+def visits(args, policy, stats, episodes):
+    """Per member of a stack its roll-outs as (obs [L, obs_dim], return), `episodes` each, from the same starts and noise."""
+    members = len(policy.flat)
+    envs = gpo_ppo.make_envs(args, members * episodes)
+    obs, _ = envs.reset(seed=gpo_ppo.env_seeds(episodes, args.seed, "states") * members)
+    noise = gpo_ppo.normal_noise([gpo_ppo.rng(args.seed, "states", 1)], args.max_episode_steps, episodes, args.act_dim)
+    act = gpo_ppo.sample_actions(policy, stats, noise)
+    data = gpo_ppo.rollout(envs, obs.reshape(len(obs), -1), act, args.max_episode_steps)
+    envs.close()
+    first = [ended[0] for ended in gpo_ppo.finished_episodes([[] for _ in obs], data)]
+    return [first[i * episodes : (i + 1) * episodes] for i in range(members)]
+
+
+def embed(args, stats, rollouts, states=1000):
+    """t-SNE of `states` states from the better half of each policy's roll-outs, all policies in one map [policies, n, 2]."""
+    from sklearn.manifold import TSNE  # here, because it takes seconds to import
+
+    samples = []
+    for k, episodes in enumerate(rollouts):
+        best = sorted(episodes, key=lambda episode: -episode[1])[: math.ceil(len(episodes) / 2)]
+        obs = gpo_ppo.normalize(np.concatenate([obs for obs, _ in best])[None], stats)[0]
+        samples.append(obs[gpo_ppo.rng(args.seed, "tsne", k).choice(len(obs), states, replace=len(obs) < states)])
+    embedding = TSNE(init="pca", random_state=args.seed).fit_transform(np.concatenate(samples))
+    return embedding.reshape(len(samples), states, 2)
+
+
+def draw_states(run, couple, episodes):
+    """The paper's state visitation: parents of one couple of round one, their child by either operator, mean returns above."""
+    args, saved = crossover.load(run)
+    if couple >= len(saved.couples):
+        gpo_ppo.refuse(f"--couple {couple}: round one had {len(saved.couples)}, counted from 0")
+    x, y = saved.couples[couple]
+    policies = {f"first parent ({saved.ids[x]})": saved.parents[x], f"second parent ({saved.ids[y]})": saved.parents[y]}
+    for kind in dict.fromkeys((args.crossover, "parameter")):
+        policies[f"child, {kind}"] = crossover.children_of(args, saved, kind)[couple]
+    stats = SimpleNamespace(mean=saved.mean.numpy()[None], inv_std=saved.inv_std.numpy()[None])
+    with torch.no_grad():
+        rollouts = visits(args, gpo_ppo.make_policy(torch.stack(list(policies.values())), args), stats, episodes)
+    points = embed(args, stats, rollouts)
+
+    figure, grid = plt.subplots(
+        1, len(policies), figsize=(2.3 * len(policies), 2.8), layout="constrained", sharex=True, sharey=True
+    )
+    for axes, name, own, played, color in zip(grid, policies, points, rollouts, COLORS):
+        axes.scatter(*points.reshape(-1, 2).T, s=2, color="0.88", linewidths=0, rasterized=True)
+        axes.scatter(*own.T, s=4, color=color, linewidths=0, alpha=0.7, rasterized=True)
+        axes.set_title(f"{name}\n{np.mean([ret for _, ret in played]):.0f}")
+        axes.set(xticks=[], yticks=[], aspect="equal")
+        axes.spines[:].set(visible=True, color="0.7")
+    text = f"t-SNE of states in the better half of {episodes} roll-outs (grey: of all policies); above, mean return of all {episodes}"
+    figure.supxlabel(text, fontsize=7)
+    return figure
+
+
+def add_to_events(run, folder, names):
+    """Adds pictures to a finished run's TensorBoard events, in a file of their own that replaces that of an earlier call.
+
+    A run that lasts is left alone: TensorBoard reads files by age, and does not come back to the one that still grows.
+    """
+    if not (run.folder / "evaluation.json").is_file():
+        return
+    for old in run.folder.glob("events.out.tfevents.*.pictures"):
+        old.unlink()
+    step = json.loads((run.folder / "evaluation.json").read_text())["global_step"]
+    with SummaryWriter(run.folder, filename_suffix=".pictures") as writer:
+        for name in names:
+            image = np.asarray(Image.open(folder / f"{name}.png").convert("RGB"))
+            writer.add_image(f"pictures/{name}", image, step, dataformats="HWC")
+
+
+def add_to_wandb(run, folder, names):
+    """Adds pictures to a finished run that Weights & Biases recorded offline; `wandb sync --append` sends them after it."""
+    if not (run.folder / "evaluation.json").is_file() or not list(run.folder.glob("wandb/offline-run-*")):
+        return
+    import wandb
+
+    step = json.loads((run.folder / "evaluation.json").read_text())["global_step"]
+    settings = dict(project=run.flags["wandb_project_name"], entity=run.flags["wandb_entity"], id=run.folder.name)
+    with wandb.init(
+        **settings, mode="offline", dir=run.folder, settings=wandb.Settings(console="off", silent=True)
+    ) as session:
+        session.log({f"pictures/{name}": wandb.Image(str(folder / f"{name}.png")) for name in names}, step=step)
+
+
 def save(figure, folder, name):
     """NAME.svg and NAME.png, the latter in 255 colours and as sharp as PNG_BYTES let it be; equal data give equal files."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -217,18 +317,30 @@ def save(figure, folder, name):
 def main(argv=None):
     """Draws and saves; returns the names of the pictures."""
     options = tyro.cli(Args, args=argv, description=__doc__)
+    for flag, value, least in (("episodes", options.episodes, 1), ("couple", options.couple, 0)):
+        if value < least:
+            gpo_ppo.refuse(f"--{flag} {value}: must be >= {least}")
     runs = [learning.read_run(folder) for folder in dict.fromkeys(options.runs)]
-    output = options.output or runs[0].folder
+    folder, output = runs[0].folder, options.output or runs[0].folder
     curves = learning.read_curves(runs, options.scalar)
     if options.csv:
         learning.write_csv(curves, options.csv)
         print(options.csv)
+    torch.set_num_threads(1)
+    pictures = {"curves": lambda: draw_curves(curves)}
+    if len(runs) == 1 and (folder / "lineage.jsonl").is_file():
+        lineage = read_lineage(folder)
+        pictures |= {"family_tree": lambda: draw_tree(lineage), "crossovers": lambda: draw_crossovers(lineage)}
+    if len(runs) == 1 and (folder / "crossover_001.pt").is_file():
+        pictures["states"] = lambda: draw_states(folder, options.couple, options.episodes)
+    names = [name for name in pictures if name in options.pictures]
     with plt.rc_context(STYLE):
-        save(draw_curves(curves), output, "curves")
-        if len(runs) == 1 and (runs[0].folder / "lineage.jsonl").is_file():
-            lineage = read_lineage(runs[0].folder)
-            save(draw_tree(lineage), output, "family_tree")
-            save(draw_crossovers(lineage), output, "crossovers")
+        for name in names:
+            save(pictures[name](), output, name)
+    if len(runs) == 1:
+        add_to_events(runs[0], output, names)
+        add_to_wandb(runs[0], output, names)
+    return names
 
 
 if __name__ == "__main__":
