@@ -235,14 +235,14 @@ def random_rollout(seed, steps=23, envs=3, obs_dim=2, ends=0.15):
 
 def test_rollout_equals_stepping_gymnasiums_own_environments(line_args):
     """Successors at the ends of episodes are the final observations; actions are clipped for the environment only."""
-    line_args.max_episode_steps = 12
+    line_args.max_episode_steps = 16
     envs, seeds = gpo_ppo.make_envs(line_args, 3), [1, 2, 3]
     obs, _ = envs.reset(seed=seeds)
     played = np.random.default_rng(0).normal(0, 2, (40, 3, 1)).astype(np.float32)
     played[:, 2] = 1.5  # runs away to the right and terminates
     data = gpo_ppo.rollout(envs, obs.reshape(3, -1), lambda seen, t: played[t], 40)
     for e, seed in enumerate(seeds):
-        env = gpo_ppo.gym.make("gpo_test/Line-v0", max_episode_steps=12)
+        env = gpo_ppo.gym.make("gpo_test/Line-v0", max_episode_steps=16)
         obs, _ = env.reset(seed=seed)
         for t in range(40):
             np.testing.assert_allclose(data.obs[t, e], obs.reshape(-1), rtol=1e-6)
