@@ -19,8 +19,10 @@ policies, in as many gradient steps as one of them takes. A shard is what functi
 environments, random numbers and gradient. Example: python joint_baseline.py --env-id HalfCheetah-v4 --algo ppo
 """
 
+import contextlib
 import ctypes
 import fcntl
+import io
 import json
 import math
 import os
@@ -66,11 +68,11 @@ class Experiment:
     max_restarts: Annotated[int, ">= 0"] = 3
     """how often a crashed group of workers starts again from the last checkpoint (with more than one worker)"""
     cuda: bool = False
-    """whether to compute updates on the accelerator (worker r uses device r modulo their number)"""
+    """whether to compute updates on the accelerator (a machine's worker r uses its device r modulo their number)"""
     run_dir: str = "runs"
     """the folder that holds the folders of all runs"""
     run_name: str | None = None
-    """the name of this run's folder; default: {env_id}__{exp_name}__{seed}__{unix time}"""
+    """the name of this run's folder; default: {env_id}__{exp_name}__{seed}__{unix time}, under torchrun its --rdzv-id"""
     resume: str | None = None
     """the folder of a run that stopped: go on from its last checkpoint, with its flags"""
     track: bool = False
@@ -107,7 +109,7 @@ class Budget:
 
 @dataclass
 class Segments:
-    segments: Annotated[int, "> 0"] = 12
+    segments: Annotated[int, "in [1, 100000]"] = 12
     """parts of the run, each of which ends with a checkpoint; as many as there are iterations for"""
 
 
@@ -177,13 +179,16 @@ BOUNDS = {
     ">= 10": lambda x: x >= 10,
     "> 0 or inf": lambda x: x > 0,
     "in [0, 1]": lambda x: 0 <= x <= 1,
+    "in [1, 100000]": lambda x: 1 <= x <= 100_000,
 }
 MAY_CHANGE_ON_RESUME = "workers max_restarts cuda run_dir run_name resume track wandb_project_name wandb_entity".split()
 
 
 def refuse(message):
     """Ends the program for bad input: one line on stderr, exit code 2."""
-    print(f"{Path(sys.argv[0]).name}: error: {message}", file=sys.stderr, flush=True)
+    if int(os.environ.get("LOCAL_RANK", 0)) > 0:
+        time.sleep(10)  # one line a machine: its first worker says it, and its end ends the others, unless only they refuse
+    print(f"{Path(sys.argv[0]).name}: error: {' '.join(message.split())[:1000]}", file=sys.stderr, flush=True)
     raise SystemExit(2)
 
 
@@ -194,17 +199,33 @@ def parse_args(argv):
     """
 
     def parse(default=None):
-        groups = tyro.cli(Args, args=argv, default=default, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
+        try:
+            with contextlib.redirect_stderr(io.StringIO()) as box:
+                groups = tyro.cli(Args, args=argv, default=default, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
+        except SystemExit as stop:
+            if stop.code:
+                refuse(" ".join(word for word in box.getvalue().split() if word.strip("╭╮╰╯│─+-|")))
+            raise
         return SimpleNamespace(**{name: x for group in vars(groups).values() for name, x in vars(group).items()})
 
     args = parse()
+    ranks = int(os.environ["WORLD_SIZE"]) if "TORCHELASTIC_RUN_ID" in os.environ else None
+    if ranks:  # started by torchrun, or by `launch`: all workers, and their restarts, must agree on the folder
+        if args.workers not in (None, ranks):
+            refuse(f"--workers {args.workers}: torchrun starts {ranks}; leave the flag out")
+        args.run_name = args.run_name or os.environ["TORCHELASTIC_RUN_ID"]
+        if args.run_name == "none" and not args.resume:
+            refuse("torchrun needs --rdzv-id NAME, or the script --run-name NAME: the name of the run's folder")
+        folder = Path(args.run_dir) / args.run_name
+        if (folder / "checkpoint.pt").exists():
+            args.resume = args.resume or str(folder)
     if args.resume:
-        stored = load_checkpoint(args.resume)["flags"]
+        resume, stored = args.resume, load_checkpoint(args.resume)["flags"]
         args = parse(Args(**{f.name: f.type(**{g.name: stored[g.name] for g in fields(f.type)}) for f in fields(Args)}))
         for name, value in vars(args).items():
             if name not in MAY_CHANGE_ON_RESUME and value != stored[name]:
                 refuse(f"--{name.replace('_', '-')} {value}: the run was started with {stored[name]}, which cannot change")
-        folder = Path(args.resume).absolute()
+        args.resume, folder = resume, Path(resume).absolute()
         args.run_dir, args.run_name = str(folder.parent), folder.name
     args.flags = dict(vars(args), resume=None)
 
@@ -214,7 +235,7 @@ def parse_args(argv):
             if value is not None and not all(BOUNDS[bound](value) for bound in bounds):
                 refuse(f"--{flag.name.replace('_', '-')} {value}: must be {bounds[0]}")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    args.workers = args.workers or min(cores, args.population)
+    args.workers = ranks or args.workers or min(cores, args.population)
     if args.workers > args.population:
         refuse(f"--workers {args.workers}: more than --population {args.population}; a worker needs at least one member")
     if args.cuda and not torch.cuda.is_available():
@@ -225,12 +246,13 @@ def parse_args(argv):
         args.exp_name = Path(__file__).stem.removesuffix("_baseline") + (f"_{args.algo}" if hasattr(args, "algo") else "")
     if not args.run_name:
         args.run_name = f"{args.env_id.replace('/', '-')}__{args.exp_name}__{args.seed}__{int(time.time())}"
-    try:
-        (Path(args.run_dir) / args.run_name).mkdir(parents=True, exist_ok=True)
-        with open(Path(args.run_dir) / args.run_name / ".lock", "a"):
-            pass
-    except OSError as error:
-        refuse(f"--run-dir {args.run_dir}: {error.strerror} ({error.filename})")
+    if not ranks or os.environ["RANK"] == "0":
+        try:
+            (Path(args.run_dir) / args.run_name).mkdir(parents=True, exist_ok=True)
+            with open(Path(args.run_dir) / args.run_name / ".lock", "a"):
+                pass
+        except OSError as error:
+            refuse(f"--run-dir {args.run_dir}: {error.strerror} ({error.filename})")
     return args
 
 
@@ -268,7 +290,7 @@ def check_environment(args):
     """Makes the environment once: refuses what a Gaussian policy cannot play, and sets obs_dim, act_dim, the horizon."""
     try:
         kwargs = json.loads(args.env_kwargs)
-    except ValueError:
+    except (ValueError, RecursionError):
         kwargs = None
     if not isinstance(kwargs, dict):
         refuse(f"--env-kwargs {args.env_kwargs!r}: must be a JSON object, such as '{{\"difficulty\": 0.5}}'")
@@ -277,7 +299,7 @@ def check_environment(args):
         args.max_episode_steps = args.max_episode_steps or min(512, own_limit or 512)
         envs = make_envs(args, 1)
     except Exception as error:  # whatever is raised here is about the id or its keywords
-        refuse(f"--env-id {args.env_id} --env-kwargs '{args.env_kwargs}': {' '.join(str(error).split())}")
+        refuse(f"--env-id {args.env_id} --env-kwargs '{args.env_kwargs}': {error}")
     for name, space in (("action", envs.single_action_space), ("observation", envs.single_observation_space)):
         if not isinstance(space, gym.spaces.Box):
             refuse(f"--env-id {args.env_id}: its {name} space is {space}; only Box is supported")
@@ -857,13 +879,33 @@ def launch(args, argv):
 
 
 def start_worker(args):
-    """Joins the group; a worker that was started again goes on from the run's checkpoint."""
+    """Joins the group of all machines' workers, and makes sure that they belong together."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG: die with the launcher, however it ends
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the launcher answers it
     dist.init_process_group("gloo")
-    if (Path(args.run_dir) / args.run_name / "checkpoint.pt").exists():
-        args.resume = str(Path(args.run_dir) / args.run_name)
+
+
+def agree(args):
+    """Refuses workers that were started with different flags, or whose machine does not see the folder of the run."""
+    everyone = gather([{**args.flags, "run_dir": None, "resume": bool(args.resume)}])  # machines may mount it elsewhere
+    for name, first in everyone[0].items():
+        for rank, flags in enumerate(everyone):
+            if flags[name] != first:
+                flag = f"--{name.replace('_', '-')}"
+                refuse(f"{flag}: {first} for worker 0, {flags[name]} for worker {rank}; give all machines the same flags")
+    token = Path(args.run_dir) / args.run_name / gather([f".token_{os.urandom(8).hex()}"])[0]
+    if world()[0] == 0:
+        token.touch()
+    dist.barrier()
+    patience = time.monotonic() + 10  # network file systems may show a new file late
+    while not token.exists() and time.monotonic() < patience:
+        time.sleep(0.1)
+    blind = [host for host in gather(["" if token.exists() else os.uname().nodename]) if host]
+    if world()[0] == 0:
+        token.unlink()
+    if blind:
+        refuse(f"--run-dir {args.run_dir}: not one folder for all machines ({blind[0]} misses a file that worker 0 wrote)")
 
 
 # ---------------------------------------------------------------- a run's folder
@@ -943,12 +985,15 @@ def open_run(args, population):
     """The run's folder, progress, log(scalars) and show(text), and its population: the given one, or the checkpoint's."""
     run = SimpleNamespace(folder=Path(args.run_dir) / args.run_name, log=lambda *_: None, show=lambda *_: None)
     run.progress = {"segment": 0, "global_step": 0, "evaluation_steps": 0, "seconds": 0.0}
+    if world()[1] > 1:
+        agree(args)
     if args.resume:
         checkpoint = load_checkpoint(args.resume)
         run.progress = checkpoint["progress"]
         for name, stack in checkpoint["population"].items():
             setattr(population, name, stack[local_slots(len(stack))])
-    device = torch.device("cuda", world()[0] % torch.cuda.device_count()) if args.cuda else torch.device("cpu")
+    local_rank = int(os.environ.get("LOCAL_RANK", 0))
+    device = torch.device("cuda", local_rank % torch.cuda.device_count()) if args.cuda else torch.device("cpu")
     population.policies, population.critics = population.policies.to(device), population.critics.to(device)
     run.start = time.perf_counter() - run.progress["seconds"]
     if world()[0] == 0:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-TEST_TOOLS = {"pytest"}
+TEST_TOOLS = {"pytest", "hypothesis"}
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if path.read_text().startswith("# /// script"))
 
 
